@@ -1,0 +1,372 @@
+"""Holds exported controllers to the decisions of Python, question by question.
+
+    .venv/bin/python -m benchmarks.export [--questions 100000] [--cases quadrotor-10 ..]
+                                          [--precisions double float] [--seconds 0]
+
+Six controllers fly in closed loops of Python: the quadrotor of the paper with a
+horizon of 10 and of 20 (chance constraints of its position), a learned cart-pole that
+must keep to its rail, the MuJoCo quadrotor whose residual is learned on a rigid body,
+the learned pole whose input acts three steps late, and the stirred tank. Every question
+of these flights (belief, reference, last decision) goes to the compiled C as well.
+Printed for each: questions, the largest difference of an input, as a share of the
+input's range in brackets, other statuses, and the median time of both [ms]. Writes
+``outputs/benchmarks/export.json``.
+"""
+
+import argparse
+from collections import Counter
+from collections.abc import Callable
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from benchmarks import delayed_pole, quadrotor
+from benchmarks.timing import use_one_thread, write_results
+from gpmpc.export import CompiledController
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import Trainer, Transitions, standardize
+from gpmpc.gp.casadi_ import successor_function
+from gpmpc.models import Affine, CasadiFunction, DelayedModel, ResidualModel
+from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Tracking
+from gpmpc.propagation import Linearization
+from gpmpc.simulation import Noise, closed_loop
+from gpmpc.systems import cart_pole, step_many, stirred_tank
+from gpmpc.trajectories import states_along
+
+Array = np.ndarray
+# of a flight, after which the next seed flies
+STEPS = 250
+
+
+class Case(NamedTuple):
+    """A controller and its flights."""
+
+    controller: GPMPC
+    #: flies a controller once, with a seed
+    fly: Callable[[Any, int], None]
+
+
+class Comparison:
+    """A controller that lets the compiled one answer every question, too.
+
+    Attributes:
+        differences: Of the inputs (questions, m).
+        other_statuses: Pairs of names, where they differ.
+        statuses: How often Python's decisions had each.
+        seconds: Of both (questions, 2).
+    """
+
+    def __init__(self, controller: GPMPC, compiled: CompiledController):
+        self.horizon = controller.horizon
+        self.problem = controller.problem
+        self.initial_input = controller.initial_input
+        self._controller = controller
+        self._compiled = compiled
+        self.differences: list[Array] = []
+        self.inputs: list[Array] = []
+        self.other_statuses: Counter[str] = Counter()
+        self.statuses: Counter[str] = Counter()
+        self.seconds: list[tuple[float, float]] = []
+
+    @property
+    def signals(self):
+        """Names of states and inputs."""
+        return self._controller.signals
+
+    def control(self, belief, reference, previous=None):
+        """Decides by Python, and compares."""
+        began = perf_counter()
+        decision = self._controller.control(belief, reference, previous)
+        between = perf_counter()
+        compiled = self._compiled.control(belief, reference, previous)
+        ended = perf_counter()
+        self.seconds.append((between - began, ended - between))
+        self.statuses[decision.status.name] += 1
+        self.differences.append(np.abs(compiled.input - decision.input))
+        self.inputs.append(decision.input)
+        if compiled.status is not decision.status:
+            names = f"{decision.status.name}, {compiled.status.name}"
+            self.other_statuses[names] += 1
+        return decision
+
+
+def paper_quadrotor(horizon: int) -> Case:
+    """The quadrotor's outer loop, its position kept with 95 %."""
+    model = quadrotor.trained("lorenz")
+    lower, upper = quadrotor.STATE_BOUNDS["lorenz"]
+    box = Box(lower, upper, probability=0.95)
+    controller = GPMPC(
+        model,
+        Linearization(),
+        quadrotor.problem(box),
+        horizon,
+        quadrotor.HOVER,
+        iterations=1,
+    )
+    path = quadrotor.TRAJECTORIES["lorenz"]
+    references = states_along(path, np.arange(STEPS + horizon + 1.0))
+    start = references[0]
+
+    def fly(flown: Any, seed: int) -> None:
+        closed_loop(
+            quadrotor.OUTER,
+            flown,
+            references,
+            start,
+            STEPS,
+            noise=quadrotor.NOISE,
+            seed=seed,
+            on_failure="previous_plan",
+        )
+
+    return Case(controller, fly)
+
+
+def learned_cart_pole() -> Case:
+    """A cart-pole that swings up between the ends of its rail."""
+    plant = cart_pole()
+    rng = np.random.default_rng(0)
+    count = 300
+    states = rng.uniform([-1.5, -3, -np.pi, -6], [1.5, 3, np.pi, 6], (count, 4))
+    forces = rng.uniform(plant.input_lower, plant.input_upper, (count, 1))
+    after = step_many(plant, states, forces) + rng.normal(0, 1e-3, (count, 4))
+    model = ResidualModel.train(
+        Affine.identity(4, 1),
+        Transitions(states, forces, after),
+        angles=[2],
+        trainer=Trainer(predicts="difference", scaling=standardize, restarts=0),
+    )
+    problem = Problem(
+        Tracking([1, 0.01, 1, 0.01], [0.01], penalized="inputs", angles=[2]),
+        inputs=Box(plant.input_lower, plant.input_upper),
+        constraints=[Box([-1, -np.inf, -np.inf, -np.inf], [1, np.inf, np.inf, np.inf])],
+    )
+    controller = GPMPC(model, Linearization(), problem, 30, [0.0], iterations=1)
+    goal = np.asarray(plant.goal, dtype=float)
+    start = np.asarray(plant.start, dtype=float)
+
+    def fly(flown: Any, seed: int) -> None:
+        reference = goal.copy()
+        reference[0] = np.random.default_rng(seed).uniform(-1.2, 1.2)
+        closed_loop(
+            plant,
+            flown,
+            reference,
+            start,
+            STEPS,
+            noise=Noise(measurement=[1e-3] * 4),
+            seed=seed,
+            on_failure="previous_plan",
+        )
+
+    return Case(controller, fly)
+
+
+def tank() -> Case:
+    """The reactor at its unstable operating point, its temperature kept below."""
+    plant = stirred_tank()
+    rng = np.random.default_rng(0)
+    count = 200
+    goal = np.asarray(plant.goal, dtype=float)
+    states = goal + rng.uniform([-0.25, -15], [0.25, 15], (count, 2))
+    coolant = rng.uniform(plant.input_lower, plant.input_upper, (count, 1))
+    after = step_many(plant, states, coolant)
+    after = after + rng.normal(0, [1e-3, 0.1], (count, 2))
+    calm = np.abs(after[:, 1] - goal[1]) < 60.0  # the reaction did not run away
+    data = Transitions(states[calm], coolant[calm], after[calm])
+    trainer = Trainer(predicts="difference", scaling=standardize, restarts=0)
+    model = trainer(data, seed=0).posterior
+    hot = Box(upper=[np.inf, goal[1] + 3.0], probability=0.95)
+    problem = Problem(
+        Tracking([100.0, 0.01], [0.001]),
+        inputs=Box(plant.input_lower, plant.input_upper),
+        input_rates=Box([-5.0], [5.0]),
+        constraints=[hot],
+    )
+    settings = PredictionSettings(disturbance_gain=0.3)
+    controller = GPMPC(
+        model,
+        Linearization(),
+        problem,
+        15,
+        plant.initial_input,
+        settings,
+        iterations=1,
+    )
+
+    def fly(flown: Any, seed: int) -> None:
+        offset = np.random.default_rng(seed).uniform([-0.1, -8], [0.1, 8])
+        closed_loop(
+            plant,
+            flown,
+            goal,
+            goal + offset,
+            STEPS,
+            noise=Noise(measurement=[1e-3, 0.1]),
+            seed=seed,
+            on_failure="previous_plan",
+        )
+
+    return Case(controller, fly)
+
+
+def late_pole() -> Case:
+    """MuJoCo's pole whose pushes act three steps late, its pending inputs states."""
+    delay = delayed_pole.DELAY
+    planned = DelayedModel(delayed_pole.learned(), delay)
+    weights = np.zeros(planned.state_dim)
+    weights[:4] = 1.0, 3.0, 0.3, 0.3
+    pole = delayed_pole.pole
+    problem = Problem(
+        Tracking(weights.tolist(), [20.0]),
+        Box(*(limit.tolist() for limit in pole.limits)),
+    )
+    controller = GPMPC(
+        planned, Linearization(), problem, delayed_pole.HORIZON, [0.0], iterations=1
+    )
+
+    def fly(flown: Any, seed: int) -> None:
+        _fly_late_pole(flown, planned, seed)
+
+    return Case(controller, fly)
+
+
+def _fly_late_pole(flown: Any, planned: DelayedModel, seed: int) -> None:
+    """Flies one episode of the late pole."""
+    from gpmpc.mpc import Reference
+
+    delay = delayed_pole.DELAY
+    horizon = delayed_pole.HORIZON
+    pole = delayed_pole.pole
+    reference = np.zeros((STEPS + horizon + 1, planned.state_dim))
+    turns = np.arange(len(reference)) // delayed_pole.TURN % 2
+    reference[:, 0] = np.where(turns, -delayed_pole.SIDE, delayed_pole.SIDE)
+    state = pole.reset(seed)
+    pending = [np.zeros(1)] * delay
+    decision = None
+    for k in range(STEPS):
+        belief = planned.augmented(Gaussian.certain(state), np.array(pending))
+        followed = Reference(reference[k : k + horizon + 1])
+        decision = flown.control(belief, followed, decision)
+        state = pole.successor(state, pending[0])
+        pending = [*pending[1:], decision.input]
+        if pole.ended:
+            return
+
+
+def mujoco_quadrotor() -> Case:
+    """MuJoCo's quadrotor: the data sheet's rigid body, and what it misses."""
+    from benchmarks import mujoco_quadrotor as flights
+    from gpmpc.systems.mujoco_quadrotor import mujoco_quadrotor as vehicle_of
+
+    vehicle = vehicle_of()
+    nominal = vehicle.nominal
+    assert nominal is not None  # the rigid body of the data sheet
+    rng = np.random.default_rng(0)
+    rows = []
+    for k in range(3):
+        flown = flights.fly(
+            vehicle, flights.known(nominal), flights.excitation(rng), k, dither=0.1
+        )
+        rows.append((flown.measured[:-1], flown.inputs[:-1], flown.measured[1:]))
+    x, u, after = (np.concatenate(part) for part in zip(*rows, strict=True))
+    chosen = np.sort(rng.permutation(len(x))[:200])
+    model = ResidualModel.train(
+        CasadiFunction(successor_function(nominal)),
+        Transitions(x[chosen], u[chosen], after[chosen]),
+        torch.eye(12, dtype=torch.float64)[:, flights.MOVED],
+        [1, 3, 5, 6, 7, 8, 9, 10, 11],
+        trainer=Trainer(predicts="difference", scaling=standardize, restarts=0),
+    )
+    settings = PredictionSettings(disturbance_gain=0.3)
+    controller = GPMPC(
+        model,
+        Linearization(),
+        flights.PROBLEM,
+        flights.HORIZON,
+        flights.HOVER,
+        settings,
+        iterations=1,
+    )
+
+    def fly(flown: Any, seed: int) -> None:
+        wind = tuple(np.random.default_rng(seed).uniform(-3, 3, 3).tolist())
+        states = flights.along(list(flights.PATHS)[seed % 2])
+        closed_loop(
+            vehicle_of(wind=wind),
+            flown,
+            states,
+            None,
+            min(STEPS, len(states) - flights.HORIZON - 1),
+            noise=Noise(measurement=flights.MEASURED),
+            seed=seed,
+            on_failure="previous_plan",
+        )
+
+    return Case(controller, fly)
+
+
+CASES: dict[str, Callable[[], Case]] = {
+    "quadrotor-10": lambda: paper_quadrotor(10),
+    "quadrotor-20": lambda: paper_quadrotor(20),
+    "cart-pole": learned_cart_pole,
+    "mujoco-quadrotor": mujoco_quadrotor,
+    "delayed-pole": late_pole,
+    "tank": tank,
+}
+
+
+def compare(name: str, case: Case, questions: int, precision: Any) -> dict[str, Any]:
+    """Asks both a number of questions; returns the row of a table."""
+    compiled = CompiledController(case.controller, precision)
+    comparison = Comparison(case.controller, compiled)
+    seed = 0
+    while len(comparison.differences) < questions:
+        case.fly(comparison, seed)
+        seed += 1
+    differences = np.array(comparison.differences)
+    lower, upper = case.controller.problem.inputs.first
+    inputs = np.array(comparison.inputs)
+    moved = inputs.max(axis=0) - inputs.min(axis=0)
+    ranges = np.where(np.isfinite(upper - lower), upper - lower, moved)
+    python, c = np.median(comparison.seconds, axis=0) * 1e3
+    return {
+        "case": name,
+        "precision": precision,
+        "questions": len(differences),
+        "largest": float(differences.max()),
+        "share": float((differences / ranges).max()),
+        "other_statuses": dict(comparison.other_statuses),
+        "statuses": dict(comparison.statuses),
+        "python_ms": float(python),
+        "c_ms": float(c),
+    }
+
+
+def main() -> None:
+    """Asks, compares and prints."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--questions", type=int, default=100_000)
+    parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
+    parser.add_argument("--precisions", nargs="+", default=["double", "float"])
+    arguments = parser.parse_args()
+    use_one_thread()
+    rows = []
+    for name in arguments.cases:
+        case = CASES[name]()
+        for precision in arguments.precisions:
+            row = compare(name, case, arguments.questions, precision)
+            rows.append(row)
+            print(
+                f"{name:18}{precision:8}{row['questions']:8}{row['largest']:10.2g} "
+                f"({row['share']:.2g}) {row['other_statuses'] or 'same statuses'} "
+                f"{row['statuses']} {row['python_ms']:.3f} {row['c_ms']:.3f}",
+                flush=True,
+            )
+    write_results("export", rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,12 @@
+"""Controllers as C: one header and one source that decide as Python does."""
+
+from gpmpc.export._binding import CompiledController, CompiledLoop, compiled_controller
+from gpmpc.export._write import Export, export_c
+
+__all__ = [
+    "CompiledController",
+    "CompiledLoop",
+    "Export",
+    "compiled_controller",
+    "export_c",
+]

@@ -1,0 +1,54 @@
+"""What cannot be exported, refused by name before anything is written."""
+
+from typing import Any
+
+from gpmpc._dynamics import check_next_states
+from gpmpc.exceptions import SettingError, check_choice
+from gpmpc.mpc import GPMPC, Inequality
+from gpmpc.qp import DualActiveSet
+
+
+def check_exportable(controller: Any, on_failure: str) -> None:
+    """Raises ``SettingError`` of the first setting that a file in C cannot hold."""
+    if not isinstance(controller, GPMPC):
+        rule = "an exported one is GPMPC"
+        raise SettingError("controller", f"{rule}; got {type(controller).__name__}")
+    check_next_states(controller.prediction.model)
+    check_choice("on_failure", on_failure, ("previous_plan", "hold"))
+    _check_programs(controller)
+    _check_covariance(controller)
+    _check_solver(controller.solver)
+
+
+def _check_programs(controller: GPMPC) -> None:
+    """Raises unless a step takes one program."""
+    if controller._most_programs > 1:
+        rule = "an exported step takes one program; fly with iterations=1 first"
+        raise SettingError("iterations", f"{rule}; got {controller.iterations}")
+
+
+def _check_covariance(controller: GPMPC) -> None:
+    """Raises unless covariances are first-order ones, or none."""
+    settings = controller.prediction.settings
+    if settings.covariance not in ("zero_order", "none"):
+        rule = "an exported program holds means: 'zero_order' or 'none'"
+        raise SettingError("covariance", f"{rule}; got {settings.covariance!r}")
+    if not controller.prediction.linearizer.needs_no_covariance:
+        rule = "an exported covariance is linearised: Linearization()"
+        got = type(controller.prediction.propagator).__name__
+        raise SettingError("propagator", f"{rule}; got {got}")
+
+
+def _check_solver(solver: Any) -> None:
+    """Raises unless the solver is the dual active set, without a clock."""
+    if not isinstance(solver, DualActiveSet):
+        rule = "an exported one is DualActiveSet()"
+        raise SettingError("solver", f"{rule}; got {type(solver).__name__}")
+    if solver.time_limit is not None:
+        rule = "an exported step knows no clock; take iteration_limit"
+        raise SettingError("solver.time_limit", f"{rule}; got {solver.time_limit}")
+
+
+def is_smooth(constraint: Any) -> bool:
+    """Returns whether a constraint is a function that is linearised along plans."""
+    return isinstance(constraint, Inequality)

@@ -1,0 +1,418 @@
+"""Models as C: one function for each model, around the tables of its GPs."""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from gpmpc._dynamics import to_array
+from gpmpc.exceptions import SettingError
+from gpmpc.export._expressions import expansion_lines, graph_of_tape, value_lines
+from gpmpc.export._text import Numbers, integers
+from gpmpc.gp import GPPosterior
+from gpmpc.models import Affine, DelayedModel, DisturbedModel, KnownModel, ResidualModel
+from gpmpc.models._wrapper import LinearWrapper
+
+Array = np.ndarray
+
+_SIGNATURE = (
+    "static void {name}(const real *x, const real *u, wide *memory, real *mean,\n"
+    "    real *A, real *B, real *V)"
+)
+_TAPE_SIGNATURE = "static void {name}(const real *x, const real *u, real *value)"
+_TAPE_EXPANSION = (
+    "static void {name}(const real *x, const real *u, real *value, real *jacobian)"
+)
+# a function need not depend on both
+_UNUSED = ("(void)x;", "(void)u;")
+
+
+class ModelWriter:
+    """Writes the functions and tables of one model.
+
+    Attributes:
+        memory: Numbers that the model's functions are lent to work in.
+        points: Points of all GPs, by GP.
+    """
+
+    def __init__(self, numbers: Numbers, variances: bool, means_alone: bool):
+        self._numbers = numbers
+        self._variances = variances
+        self._means_alone = means_alone
+        self._parts: list[str] = []
+        self._count = 0
+        self.memory = 0
+        self.points: list[int] = []
+
+    @property
+    def text(self) -> str:
+        """All that was written."""
+        return "\n".join(self._parts)
+
+    @property
+    def _wanted_variance(self) -> str:
+        """The argument of a function that may write variances."""
+        return "V ? variance : 0" if self._variances else "0"
+
+    @property
+    def _ignored_variance(self) -> list[str]:
+        """The line that says that no variance is written."""
+        return [] if self._variances else ["(void)V;"]
+
+    def _variance_array(self, size: int) -> list[str]:
+        """The line that declares variances, where they are wanted."""
+        return [f"real variance[{size}];"] if self._variances else []
+
+    def write(self, model: Any, name: str) -> None:
+        """Writes the function of a model.
+
+        Raises:
+            SettingError: A part of it cannot be exported.
+        """
+        if isinstance(model, GPPosterior):
+            self._write_posterior(model, name)
+        elif isinstance(model, ResidualModel):
+            self._write_residual(model, name)
+        elif isinstance(model, KnownModel):
+            self._write_known(model, name)
+        elif isinstance(model, LinearWrapper):
+            self._write_wrapper(model, name)
+        else:
+            raise SettingError(
+                "model",
+                "an exported one is a GPPosterior, a ResidualModel, a KnownModel, or "
+                "one of these in a DelayedModel or DisturbedModel; "
+                f"got {type(model).__name__}",
+            )
+
+    def _write_posterior(self, model: GPPosterior, name: str) -> None:
+        """Writes a model that is GPs alone."""
+        table = self._write_gps(model)
+        n = model.state_dim
+        m = model.input_dim
+        k = model.output_dim
+        adds_state = model.predicts == "difference"
+        what = "x + f(x, u)" if adds_state else "f(x, u)"
+        d = n + m
+        body = [
+            f"real query[{d}];",
+            f"real jacobian[{k * d}];",
+            *self._variance_array(k),
+            "int a;",
+            *self._ignored_variance,
+            f"copy(x, query, {n});",
+            f"copy(u, query + {n}, {m});",
+            f"gp_evaluate(&{table}, query, memory, mean, A ? jacobian : 0,",
+            f"            {self._wanted_variance});",
+        ]
+        if adds_state:
+            body += [f"add_scaled(1, x, mean, {n});"]
+        body += [
+            f"for (a = 0; a < {k} && A; a++) {{",
+            f"    copy(jacobian + a * {d}, A + a * {n}, {n});",
+            f"    copy(jacobian + a * {d} + {n}, B + a * {m}, {m});",
+        ]
+        if adds_state:
+            body += [f"    A[a * {n} + a] += 1;"]
+        body += ["}"]
+        if self._variances:
+            body += _diagonal_variance(k)
+        self._function(_SIGNATURE.format(name=name), body, f"x+ = {what}, f by GPs")
+
+    def _write_gps(self, gp: GPPosterior) -> str:
+        """Writes the tables of GPs over the same points; returns their name."""
+        if str(gp.dtype) != "torch.float64":
+            raise SettingError("model", f"must be in float64; got {gp.dtype}")
+        prefix = f"gp{len(self.points)}"
+        size, d = gp.features.shape
+        k = gp.output_dim
+        self.points.append(size)
+        self.memory = max(self.memory, (d + 2) * size)
+        features = to_array(gp.features)
+        lengthscales = to_array(gp.lengthscales)
+        table = partial(Numbers("double").table, kind="wide")
+        parts = [
+            f"/* GPs {prefix}: k = {k} outputs over N = {size} points of {d} features",
+            "",
+            "   m_a(x~) = offset_a + sum_i beta_ai k_a(x~_i, x~)",
+            "   k_a(x~_i, x~) = exp(log sf2_a - 1/2 sum_d (x~_id - x~_d)^2 / l_ad^2) */",
+            table(f"{prefix}_points", features.T, "x~, a row for each feature (d, N)"),
+            table(f"{prefix}_scales", lengthscales**-2.0, "1 / l^2 (k, d)"),
+            table(
+                f"{prefix}_log_signal",
+                np.log(to_array(gp.signal_variance)),
+                "log sf2 (k,)",
+            ),
+            table(f"{prefix}_weights", to_array(gp.weights), "beta (k, N)"),
+            table(f"{prefix}_offset", to_array(gp.offset), "prior means (k,)"),
+        ]
+        cholesky = "0"
+        if self._variances:
+            cholesky = f"{prefix}_cholesky"
+            rows, columns = np.tril_indices(size)
+            factors = to_array(gp.cholesky)[:, rows, columns]
+            comment = "K + sn2 I = L L': lower triangles, row after row"
+            parts.append(table(cholesky, factors, comment))
+        parts.append(
+            f"static const gp_tables {prefix} = {{\n"
+            f"    {size}, {d}, {k}, {prefix}_points, {prefix}_scales,\n"
+            f"    {prefix}_log_signal, {prefix}_weights, {prefix}_offset, {cholesky}}};\n"
+        )
+        self._parts.append("\n".join(parts))
+        return prefix
+
+    def _write_residual(self, model: ResidualModel, name: str) -> None:
+        """Writes x+ = f0(x, u) + B d(phi(x, u))."""
+        if callable(model.B):
+            raise SettingError(
+                "model",
+                "an exported residual acts by a constant B (n, k); got a function "
+                "of the state",
+            )
+        table = self._write_gps(model.residual)
+        n = model.state_dim
+        m = model.input_dim
+        k = model.residual.output_dim
+        features = model.features
+        d = features.dim + len(features.inputs)
+        self._parts.append(
+            self._numbers.table(f"{name}_effect", to_array(model.B), "B (n, k)")
+        )
+        columns = [*features.columns.tolist(), *features.inputs]
+        self._parts.append(
+            integers(
+                f"{name}_columns",
+                columns,
+                "the state of each feature, then the inputs",
+            )
+        )
+        self._write_nominal(model.nominal, n, m, f"{name}_nominal")
+        sines = set(features.sines.tolist())
+        body = [
+            f"real query[{d}];",
+            f"real slopes[{d}];",
+            f"real residual[{k}];",
+            f"real jacobian[{k * d}];",
+            *self._variance_array(k),
+            "int a, i, j;",
+            *self._ignored_variance,
+            f"{name}_nominal(x, u, mean, A, B);",
+            f"for (i = 0; i < {d}; i++) {{",
+            f"    query[i] = i < {features.dim} ? x[{name}_columns[i]]",
+            f"                                  : u[{name}_columns[i]];",
+            "    slopes[i] = 1;",
+            "}",
+        ]
+        for i in sorted(sines):
+            body += [
+                f"query[{i}] = SIN(x[{columns[i]}]);",
+                f"query[{i + 1}] = COS(x[{columns[i]}]);",
+                f"slopes[{i}] = query[{i + 1}];",
+                f"slopes[{i + 1}] = -query[{i}];",
+            ]
+        body += [
+            f"gp_evaluate(&{table}, query, memory, residual, A ? jacobian : 0,",
+            f"            {self._wanted_variance});",
+            f"for (i = 0; i < {n}; i++)",
+            f"    mean[i] += dot({name}_effect + i * {k}, residual, {k});",
+            f"for (i = 0; i < {n} && A; i++)",
+            f"    for (a = 0; a < {k}; a++) {{",
+            f"        const real effect = {name}_effect[i * {k} + a];",
+            f"        for (j = 0; j < {d} && effect != 0; j++) {{",
+            f"            real slope = effect * jacobian[a * {d} + j] * slopes[j];",
+            f"            if (j < {features.dim})",
+            f"                A[i * {n} + {name}_columns[j]] += slope;",
+            "            else",
+            f"                B[i * {m} + {name}_columns[j]] += slope;",
+            "        }",
+            "    }",
+        ]
+        propagated = [
+            f"for (i = 0; i < {n} && V; i++)",
+            f"    for (j = 0; j < {n}; j++) {{",
+            f"        V[i * {n} + j] = 0;",
+            f"        for (a = 0; a < {k}; a++)",
+            f"            V[i * {n} + j] += {name}_effect[i * {k} + a] * variance[a]",
+            f"                              * {name}_effect[j * {k} + a];",
+            "    }",
+        ]
+        if self._variances:
+            body += propagated
+        self._function(
+            _SIGNATURE.format(name=name),
+            body,
+            "x+ = f0(x, u) + B d(phi(x, u)), d by GPs",
+        )
+
+    def _write_nominal(self, nominal: Any, n: int, m: int, name: str) -> None:
+        """Writes f0 and its derivatives."""
+        tape = getattr(nominal, "tape", None)
+        if isinstance(nominal, Affine):
+            self._write_affine(nominal, n, m, name)
+        elif tape is not None:
+            self._write_tape(tape, n, m, name)
+        else:
+            raise SettingError(
+                "model",
+                "an exported nominal model is Affine, or a CasadiFunction of "
+                f"elementary operations; got {type(nominal).__name__}",
+            )
+
+    def _write_affine(self, nominal: Affine, n: int, m: int, name: str) -> None:
+        """Writes f0 = A x + B u + c."""
+        table = self._numbers.table
+        A = to_array(nominal.A)
+        B = to_array(nominal.B)
+        self._parts += [
+            table(f"{name}_A", A, "of f0 (n, n)"),
+            table(f"{name}_B", B, "of f0 (n, m)"),
+            table(f"{name}_c", to_array(nominal.c), "of f0 (n,)"),
+        ]
+        body = [
+            "int i;",
+            f"for (i = 0; i < {n}; i++)",
+            f"    mean[i] = {name}_c[i] + dot({name}_A + i * {n}, x, {n})",
+            f"              + dot({name}_B + i * {m}, u, {m});",
+            "if (A) {",
+            f"    copy({name}_A, A, {n * n});",
+            f"    copy({name}_B, B, {n * m});",
+            "}",
+        ]
+        self._nominal_function(name, body, "f0 = A x + B u + c")
+
+    def _write_tape(self, tape: Any, n: int, m: int, name: str) -> None:
+        """Writes f0, a list of scalar operations, with its derivatives."""
+        graph, value = graph_of_tape(tape)
+        names = _input_names(n, m)
+        if self._means_alone:
+            lines = value_lines(graph, value, names, self._numbers)
+            self._function(
+                _TAPE_SIGNATURE.format(name=f"{name}_value"),
+                [*_UNUSED, *lines],
+                "f0(x, u)",
+            )
+        lines = expansion_lines(graph, value, names, self._numbers)
+        self._function(
+            _TAPE_EXPANSION.format(name=f"{name}_expansion"),
+            [*_UNUSED, "(void)jacobian;", *lines],
+            "f0(x, u) and its derivatives by (x, u); those that are zero stay",
+        )
+        d = n + m
+        body = [
+            f"real jacobian[{n * d}];",
+            "int i;",
+        ]
+        if self._means_alone:
+            body += ["if (!A) {", f"    {name}_value(x, u, mean);", "    return;", "}"]
+        body += [
+            f"fill(jacobian, 0, {n * d});",
+            f"{name}_expansion(x, u, mean, jacobian);",
+            f"for (i = 0; i < {n} && A; i++) {{",
+            f"    copy(jacobian + i * {d}, A + i * {n}, {n});",
+            f"    copy(jacobian + i * {d} + {n}, B + i * {m}, {m});",
+            "}",
+        ]
+        self._nominal_function(name, body, "f0 as the model takes it")
+
+    def _write_known(self, model: KnownModel, name: str) -> None:
+        """Writes a model without uncertainty."""
+        n = model.state_dim
+        m = model.input_dim
+        self._write_nominal(model.function, n, m, f"{name}_nominal")
+        body = [
+            "(void)memory;",
+            f"{name}_nominal(x, u, mean, A, B);",
+            "if (V)",
+            f"    fill(V, 0, {n * n});",
+        ]
+        self._function(_SIGNATURE.format(name=name), body, "x+ = f0(x, u)")
+
+    def _write_wrapper(self, model: LinearWrapper, name: str) -> None:
+        """Writes z+ = [f(x, Z z + W u); 0] + L z + M u."""
+        inner = f"{name}_inner"
+        self.write(model.model, inner)
+        p = model.model.state_dim
+        n = model.state_dim
+        m = model.input_dim
+        table = self._numbers.table
+        Z, W, L, M = model.linear_part
+        self._parts += [
+            table(f"{name}_Z", Z, "(m, k)"),
+            table(f"{name}_W", W, "(m, m)"),
+            table(f"{name}_L", L, "(k, k)"),
+            table(f"{name}_M", M, "(k, m)"),
+        ]
+        body = [
+            f"real acting[{m}];",
+            f"real next[{p}];",
+            f"real by_state[{p * p}];",
+            f"real by_input[{p * m}];",
+            *self._variance_array(p * p),
+            "int i, j;",
+            *self._ignored_variance,
+            f"for (i = 0; i < {m}; i++)",
+            f"    acting[i] = dot({name}_Z + i * {n}, x, {n})",
+            f"                + dot({name}_W + i * {m}, u, {m});",
+            f"{inner}(x, acting, memory, next, A ? by_state : 0, A ? by_input : 0,",
+            f"      {self._wanted_variance});",
+            f"for (i = 0; i < {n}; i++)",
+            f"    mean[i] = dot({name}_L + i * {n}, x, {n})",
+            f"              + dot({name}_M + i * {m}, u, {m}) + (i < {p} ? next[i] : 0);",
+            "if (A) {",
+            f"    copy({name}_L, A, {n * n});",
+            f"    copy({name}_M, B, {n * m});",
+            f"    for (i = 0; i < {p}; i++) {{",
+            f"        add_scaled(1, by_state + i * {p}, A + i * {n}, {p});",
+            f"        for (j = 0; j < {m}; j++) {{",
+            f"            const real slope = by_input[i * {m} + j];",
+            f"            add_scaled(slope, {name}_Z + j * {n}, A + i * {n}, {n});",
+            f"            add_scaled(slope, {name}_W + j * {m}, B + i * {m}, {m});",
+            "        }",
+            "    }",
+            "}",
+        ]
+        padded = [
+            "if (V) {",
+            f"    fill(V, 0, {n * n});",
+            f"    for (i = 0; i < {p}; i++)",
+            f"        copy(variance + i * {p}, V + i * {n}, {p});",
+            "}",
+        ]
+        if self._variances:
+            body += padded
+        what = "z+ = [f(x, Z z + W u); 0] + L z + M u"
+        if isinstance(model, DelayedModel):
+            what += f": inputs act {model.delay:g} steps late"
+        elif isinstance(model, DisturbedModel):
+            what += ": disturbances are states"
+        self._function(_SIGNATURE.format(name=name), body, what)
+
+    def _nominal_function(self, name: str, body: Sequence[str], comment: str) -> None:
+        """Writes a nominal function."""
+        signature = (
+            f"static void {name}(const real *x, const real *u, real *mean, real *A,\n"
+            "    real *B)"
+        )
+        self._function(signature, body, comment)
+
+    def _function(self, signature: str, body: Sequence[str], comment: str) -> None:
+        """Writes a function, its equation above it."""
+        lines = "\n".join(f"    {line}" for line in body)
+        self._parts.append(f"/* {comment} */\n{signature}\n{{\n{lines}\n}}\n")
+
+
+def _diagonal_variance(k: int) -> list[str]:
+    """Returns the lines that write V = diag(variance)."""
+    return [
+        "if (V) {",
+        f"    fill(V, 0, {k * k});",
+        f"    for (a = 0; a < {k}; a++)",
+        f"        V[a * {k} + a] = variance[a];",
+        "}",
+    ]
+
+
+def _input_names(n: int, m: int) -> list[str]:
+    """Returns how a function of a state and an input reads its arguments."""
+    return [f"x[{i}]" for i in range(n)] + [f"u[{i}]" for i in range(m)]

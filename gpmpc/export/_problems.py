@@ -1,0 +1,202 @@
+"""A controller's dimensions, settings, weights and bounds as C."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from gpmpc.export._functions import FunctionWriter
+from gpmpc.export._text import Numbers, comment, integers
+from gpmpc.mpc import GPMPC
+from gpmpc.mpc._constraints import _FixedRows
+
+Array = np.ndarray
+
+# The tolerance of a solver in float, the power of the rounding unit that 1e-9 is.
+_FLOAT_TOLERANCE = 1e-4
+# The largest price in float, in the cost's largest weight.
+_FLOAT_PRICE = 1e3
+
+
+class Definitions(NamedTuple):
+    """The settings that the code is compiled with, by the names in C."""
+
+    values: dict[str, str]
+    comments: dict[str, str]
+
+    def text(self) -> str:
+        """Returns them as lines of a header."""
+        lines = []
+        for name, value in self.values.items():
+            note = self.comments.get(name)
+            lines.append(
+                f"#define {name} {value}" + (f" /* {comment(note)} */" if note else "")
+            )
+        return "\n".join(lines)
+
+
+def tightens(controller: GPMPC) -> bool:
+    """Returns whether covariances move a row: else none is computed."""
+    return controller.prediction.settings.covariance == "zero_order" and bool(
+        _kappas(controller).any()
+    )
+
+
+def rolls_out(controller: GPMPC) -> bool:
+    """Returns whether every plan is rolled out before it is judged."""
+    prediction = controller.prediction
+    return prediction.constraints.smooth or prediction.settings.rolled_out
+
+
+def _kappas(controller: GPMPC) -> Array:
+    """Returns the deviations between means and sides (r,)."""
+    rows = controller.prediction.constraints._rows
+    margins = getattr(rows, "_margins", None)
+    if margins is None:
+        return np.zeros(controller.prediction.constraints.per_stage)
+    return margins[0]
+
+
+def definitions(
+    controller: GPMPC,
+    numbers: Numbers,
+    functions: FunctionWriter,
+    model_memory: int,
+    on_failure: str,
+) -> Definitions:
+    """Returns the dimensions and settings of a controller."""
+    prediction = controller.prediction
+    settings = prediction.settings
+    constraints = prediction.constraints
+    cost = prediction.costs.quadratic
+    solver = controller.solver
+    gain = settings.disturbance_gain
+    tolerance = float(getattr(solver, "tolerance", 1e-9))
+    if numbers.precision == "float":
+        tolerance = max(tolerance, _FLOAT_TOLERANCE)
+    angles = list(controller.problem.cost.angles)
+    flags = {
+        "GPMPC_IS_FLOAT": numbers.precision == "float",
+        "GPMPC_HAS_RATES": controller.problem.input_rates.finite,
+        "GPMPC_SOFT": constraints.soft,
+        "GPMPC_ELASTIC": constraints.gives_way,
+        "GPMPC_SMOOTH": constraints.smooth,
+        "GPMPC_OUTPUTS": bool(controller.problem.outputs),
+        "GPMPC_TUBES": tightens(controller),
+        "GPMPC_FEEDBACK": settings.feedback,
+        "GPMPC_ROLLS_OUT": rolls_out(controller),
+        "GPMPC_HELD": settings.is_held,
+        "GPMPC_INCREMENTAL": settings.is_incremental,
+        "GPMPC_ESTIMATES": gain > 0,
+        "GPMPC_HOLDS": on_failure == "hold",
+        "GPMPC_FEEDBACK_COORDINATES": True,
+    }
+    values = {
+        "GPMPC_STATES": str(prediction.state_dim),
+        "GPMPC_INPUTS": str(prediction.input_dim),
+        "GPMPC_HORIZON": str(prediction.horizon),
+        "GPMPC_STAGES": str(prediction.stage_count),
+        "GPMPC_ROWS": str(constraints.per_stage),
+        "GPMPC_PARAMETERS": str(functions.parameters),
+        "GPMPC_ITERATIONS": str(getattr(solver, "iteration_limit", None) or 0),
+        "GPMPC_MODEL_MEMORY": str(model_memory),
+        "GPMPC_PENALIZED": str(cost.penalized),
+        "GPMPC_STATE_WEIGHTS": str(len(cost.state)),
+        "GPMPC_INPUT_WEIGHTS": str(len(cost.input)),
+        "GPMPC_COST_ANGLE_COUNT": str(len(angles)),
+        "GPMPC_STATE_ANGLE_COUNT": str(len(prediction.angles)),
+        "GPMPC_TOLERANCE": f"(gpmpc_real){tolerance!r}",
+        "GPMPC_DISTURBANCE_GAIN": f"(gpmpc_real){float(gain)!r}",
+    }
+    values |= {name: str(int(flag)) for name, flag in flags.items()}
+    comments = {
+        "GPMPC_STATES": "n",
+        "GPMPC_INPUTS": "m",
+        "GPMPC_HORIZON": "H, the number of predicted states",
+        "GPMPC_STAGES": "stage models: H, or one that is held",
+        "GPMPC_ROWS": "rows of the states' constraints at a stage, r",
+        "GPMPC_PARAMETERS": "of outputs and inequalities, q",
+        "GPMPC_ITERATIONS": "changes of the working set; 0: 100 + 10 per constraint",
+        "GPMPC_MODEL_MEMORY": "numbers that the model works in",
+        "GPMPC_PENALIZED": "what R weighs: 0 inputs, 1 deviations, 2 increments",
+        "GPMPC_TOLERANCE": "of a solution, as a share of its size",
+        "GPMPC_DISTURBANCE_GAIN": "of the estimate of a constant error",
+    }
+    return Definitions(values, comments)
+
+
+def tables(controller: GPMPC, numbers: Numbers) -> str:
+    """Returns weights, bounds and rows as constant arrays."""
+    prediction = controller.prediction
+    problem = controller.problem
+    cost = prediction.costs.quadratic
+    limits = prediction.limits
+    constraints = prediction.constraints
+    rows = constraints._rows
+    if isinstance(rows, _FixedRows):
+        fixed = rows._rows
+        gradients = fixed.E[0]
+        lower, upper = fixed.lower, fixed.upper
+    else:
+        linear = rows._linear
+        gradients, lower, upper = linear.F, linear.lower, linear.upper
+    table = numbers.table
+    parts = [
+        table("state_weights", cost.state[:, 0], "Q of s_1 .. (n, n)"),
+        table("terminal_weight", cost.terminal[0], "of s_H (n, n)"),
+        table("input_weights", cost.input, "R (m, m)"),
+        table("initial_input", prediction.initial_input, "before the first step"),
+        table("input_lower", limits.lower, "bounds of u_k (H, m)"),
+        table("input_upper", limits.upper),
+        table("rate_lower", limits.rate_lower, "bounds of u_k - u_{k-1} (H, m)"),
+        table("rate_upper", limits.rate_upper),
+        table("row_gradients", gradients, "of the states' rows by the state (r, n)"),
+        table("row_lower", lower, "bounds of the rows (H, r)"),
+        table("row_upper", upper),
+        table("row_prices", _prices(controller, numbers), "of violations (r,)"),
+        integers("cost_angles", problem.cost.angles, "errors modulo 2 pi"),
+        integers("state_angles", prediction.angles, "angles of the cost or the model"),
+    ]
+    if constraints.gives_way:
+        parts.append(
+            integers(
+                "row_is_elastic", constraints.elastic.tolist(), "rows that give way"
+            )
+        )
+    if constraints.smooth:
+        smooth = np.zeros(constraints.per_stage, dtype=int)
+        for part in getattr(rows, "_smooth", ()):
+            smooth[part.columns] = 1
+        parts.append(integers("row_is_smooth", smooth.tolist(), "linearised rows"))
+    if tightens(controller):
+        parts.append(table("row_kappas", _kappas(controller), "deviations to a side"))
+        noise = prediction.linearizer._noise
+        n = prediction.state_dim
+        parts.append(
+            table(
+                "process_noise",
+                np.zeros((n, n)) if noise is None else noise,
+                "added to the covariance of a stage (n, n)",
+            )
+        )
+    return "\n".join(parts)
+
+
+def _prices(controller: GPMPC, numbers: Numbers) -> Array:
+    """Returns the prices of rows (r,).
+
+    Six digits say less than an exact price of 1e6 weights: in float it is 1e3 of them,
+    which still is more than nearly every bound is worth.
+    """
+    prices = controller.prediction.constraints.prices
+    if numbers.precision == "double":
+        return prices
+    finite = np.isfinite(prices)
+    exact = finite & (prices >= _FLOAT_PRICE * _largest_weight(controller))
+    return np.where(exact, _FLOAT_PRICE * _largest_weight(controller), prices)
+
+
+def _largest_weight(controller: GPMPC) -> float:
+    """Returns the largest eigenvalue of a weight."""
+    cost = controller.problem.cost
+    weights = (cost.Q, cost.terminal, cost.R)
+    return float(max(np.linalg.eigvalsh(weight).max() for weight in weights))

@@ -1,0 +1,58 @@
+"""Numbers, arrays and comments as C text."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+Precision = Literal["double", "float"]
+
+_NUMBERS_A_LINE = 4
+
+
+class Numbers:
+    """Writes numbers and arrays of one precision."""
+
+    def __init__(self, precision: Precision):
+        self.precision = precision
+
+    def number(self, value: float) -> str:
+        """Returns a number that C reads back to the same bits."""
+        if np.isinf(value):
+            return "INFINITY" if value > 0 else "-INFINITY"
+        if self.precision == "float":
+            rounded = np.float32(value)
+            text = np.format_float_scientific(rounded, unique=True)
+            if abs(float(rounded)) < 1e6 and float(rounded) == int(rounded):
+                text = f"{int(rounded)}.0"
+            return f"{text}f"
+        return repr(float(value))
+
+    def table(
+        self, name: str, values: np.ndarray, comment: str = "", kind: str = "real"
+    ) -> str:
+        """Returns a constant array, flat, row after row."""
+        flat = np.ravel(np.asarray(values, dtype=float))
+        if not flat.size:
+            flat = np.zeros(1)
+        numbers = [self.number(value) for value in flat]
+        lines = [
+            ", ".join(numbers[first : first + _NUMBERS_A_LINE])
+            for first in range(0, len(numbers), _NUMBERS_A_LINE)
+        ]
+        body = ",\n    ".join(lines)
+        head = f"/* {comment} */\n" if comment else ""
+        return f"{head}static const {kind} {name}[{flat.size}] = {{\n    {body}}};\n"
+
+
+def integers(name: str, values: Sequence[int], comment: str = "") -> str:
+    """Returns a constant array of whole numbers."""
+    listed = [str(int(value)) for value in values] or ["0"]
+    head = f"/* {comment} */\n" if comment else ""
+    body = ", ".join(listed)
+    return f"{head}static const int {name}[{len(listed)}] = {{{body}}};\n"
+
+
+def comment(text: str) -> str:
+    """Returns text that no comment of C ends early."""
+    return text.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/")

@@ -1,0 +1,125 @@
+"""Writes a controller as one header and one source in C99."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from gpmpc._files import write_whole
+from gpmpc.exceptions import check_choice
+from gpmpc.export._checks import check_exportable
+from gpmpc.export._functions import FunctionWriter
+from gpmpc.export._models import ModelWriter
+from gpmpc.export._problems import definitions, rolls_out, tables, tightens
+from gpmpc.export._text import Numbers, Precision, comment
+from gpmpc.mpc import GPMPC
+
+_HERE = Path(__file__).parent
+
+
+class Export(NamedTuple):
+    """The files of an exported controller."""
+
+    header: Path
+    source: Path
+
+
+def export_c(
+    controller: GPMPC,
+    path: str | Path,
+    precision: Precision = "double",
+    on_failure: str = "previous_plan",
+) -> Export:
+    """Writes a controller as ``gpmpc.h`` and ``gpmpc.c`` into a folder.
+
+    The code is C99, needs nothing but libm, and decides as ``ControlLoop`` does around
+    the controller, to the rounding of ``precision``.
+
+    Args:
+        controller: A ``GPMPC`` of one program a step.
+        path: The folder, which is made where it does not exist.
+        precision: Of all numbers, ``"double"`` or ``"float"``.
+        on_failure: What is applied where a step fails: ``"previous_plan"`` or
+            ``"hold"``; see ``ControlLoop``.
+
+    Raises:
+        SettingError: The controller has a part that C cannot hold; it is named.
+    """
+    check_choice("precision", precision, ("double", "float"))
+    check_exportable(controller, on_failure)
+    numbers = Numbers(precision)
+    folder = Path(path)
+    header, source = _texts(controller, numbers, on_failure)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_whole(folder / "gpmpc.h", header)
+    write_whole(folder / "gpmpc.c", source)
+    return Export(header=folder / "gpmpc.h", source=folder / "gpmpc.c")
+
+
+def _texts(controller: GPMPC, numbers: Numbers, on_failure: str) -> tuple[str, str]:
+    """Returns header and source."""
+    functions = FunctionWriter(controller, numbers)
+    prediction = controller.prediction
+    means_alone = rolls_out(controller) or prediction.settings.disturbance_gain > 0
+    model = ModelWriter(numbers, tightens(controller), means_alone)
+    model.write(prediction.model, "model")
+    settings = definitions(controller, numbers, functions, model.memory, on_failure)
+    names = _names(controller)
+    header = "\n".join(
+        [
+            _banner("A controller in C: its memory and its calls.", names),
+            "#ifndef GPMPC_H",
+            "#define GPMPC_H",
+            "",
+            f"typedef {numbers.precision} gpmpc_real;",
+            "",
+            settings.text(),
+            "",
+            _part("core.h"),
+            "#endif",
+            "",
+        ]
+    )
+    generated = "\n".join(
+        [_part("gp.c"), model.text, tables(controller, numbers), functions.text]
+    )
+    core = _part("core.c")
+    core = core.replace("/*{model}*/", generated).replace("/*{qp}*/", _part("qp.c"))
+    source = "\n".join(
+        [
+            _banner("A controller in C: tables, model, program and policy.", names),
+            '#include "gpmpc.h"',
+            "",
+            "#include <float.h>",
+            "#include <math.h>",
+            "#include <stdint.h>",
+            "#include <string.h>",
+            "",
+            _part("numbers.h"),
+            core,
+        ]
+    )
+    return header, source
+
+
+def _part(name: str) -> str:
+    """Returns a part of the code that is the same for every controller."""
+    return (_HERE / name).read_text()
+
+
+def _names(controller: GPMPC) -> list[str]:
+    """Returns the lines that name states and inputs."""
+    prediction = controller.prediction
+    signals = prediction.signals
+    states = signals.state_names or [f"x{i}" for i in range(prediction.state_dim)]
+    inputs = signals.input_names or [f"u{i}" for i in range(prediction.input_dim)]
+    lines = [f"state {i}: {name}" for i, name in enumerate(states)]
+    lines += [f"input {i}: {name}" for i, name in enumerate(inputs)]
+    if signals.time_step:
+        lines.append(f"time step: {signals.time_step:g} s")
+    return lines
+
+
+def _banner(title: str, names: list[str]) -> str:
+    """Returns the comment that a file begins with."""
+    lines = [title, "Written by gpmpc; the next export overwrites it.", "", *names]
+    body = "\n   ".join(comment(line) for line in lines)
+    return f"/* {body} */\n"

@@ -1,0 +1,1344 @@
+/* ------------------------------------------------------------------------------------
+   Small dense algebra. Matrices are rows one after the other, without gaps.
+   --------------------------------------------------------------------------------- */
+
+typedef gpmpc_real real;
+
+enum {
+    n = GPMPC_STATES,
+    m = GPMPC_INPUTS,
+    H = GPMPC_HORIZON,
+    r = GPMPC_ROWS,
+    N = GPMPC_SIZE
+};
+
+static real larger(real a, real b) { return a > b ? a : b; }
+
+static real smaller(real a, real b) { return a < b ? a : b; }
+
+static real absolute(real a) { return a < 0 ? -a : a; }
+
+static int is_finite(real a) { return a - a == 0; }
+
+static int all_finite(const real *x, int size)
+{
+    int i;
+    for (i = 0; i < size; i++)
+        if (!is_finite(x[i]))
+            return 0;
+    return 1;
+}
+
+static void copy(const real *x, real *y, int size)
+{
+    int i;
+    for (i = 0; i < size; i++)
+        y[i] = x[i];
+}
+
+static void fill(real *x, real value, int size)
+{
+    int i;
+    for (i = 0; i < size; i++)
+        x[i] = value;
+}
+
+/* x'y; long ones in eight interleaved parts, which need not wait for each other */
+static real dot(const real *x, const real *y, int size)
+{
+    real total = 0;
+    int i = 0;
+    if (size >= 32) {
+        real parts[8] = {0};
+        int lane;
+        for (; i + 8 <= size; i += 8)
+            for (lane = 0; lane < 8; lane++)
+                parts[lane] += x[i + lane] * y[i + lane];
+        total = ((parts[0] + parts[4]) + (parts[2] + parts[6]))
+                + ((parts[1] + parts[5]) + (parts[3] + parts[7]));
+    }
+    for (; i < size; i++)
+        total += x[i] * y[i];
+    return total;
+}
+
+/* y <- y + factor x */
+static void add_scaled(real factor, const real *x, real *y, int size)
+{
+    int i;
+    for (i = 0; i < size; i++)
+        y[i] += factor * x[i];
+}
+
+/* out <- A x, A (rows, columns) */
+static void multiply(const real *A, const real *x, int rows, int columns, real *out)
+{
+    int i;
+    for (i = 0; i < rows; i++)
+        out[i] = dot(A + i * columns, x, columns);
+}
+
+/* out <- A B, A (rows, inner), B (inner, columns) */
+static void product(const real *A, const real *B, int rows, int inner, int columns,
+                    real *out)
+{
+    int i, j;
+    for (i = 0; i < rows; i++) {
+        fill(out + i * columns, 0, columns);
+        for (j = 0; j < inner; j++)
+            add_scaled(A[i * inner + j], B + j * columns, out + i * columns, columns);
+    }
+}
+
+/* out <- out + A'B, A (inner, rows), B (inner, columns) */
+static void add_transposed_product(const real *A, const real *B, int inner, int rows,
+                                   int columns, real *out)
+{
+    int i, j;
+    for (j = 0; j < inner; j++)
+        for (i = 0; i < rows; i++)
+            add_scaled(A[j * rows + i], B + j * columns, out + i * columns, columns);
+}
+
+/* a <- a + A b for angles: whole turns in a difference of angles */
+static real whole_turns(real angle)
+{
+    const real turn = REAL(6.283185307179586476925286766559);
+    return turn * ROUND_EVEN(angle / turn);
+}
+
+/* X <- A^-1 X, A (size, size) positive definite, X (size, columns); A is lost */
+static int solve_positive(real *A, int size, real *X, int columns)
+{
+    int i, j;
+    for (i = 0; i < size; i++) {
+        real pivot;
+        for (j = 0; j < i; j++)
+            A[i * size + j] = (A[i * size + j] - dot(A + i * size, A + j * size, j))
+                              / A[j * size + j];
+        pivot = A[i * size + i] - dot(A + i * size, A + i * size, i);
+        if (!(pivot > 0))
+            return 0;
+        A[i * size + i] = SQRT(pivot);
+    }
+    for (i = 0; i < size; i++) { /* L^-1 X */
+        for (j = 0; j < i; j++)
+            add_scaled(-A[i * size + j], X + j * columns, X + i * columns, columns);
+        for (j = 0; j < columns; j++)
+            X[i * columns + j] /= A[i * size + i];
+    }
+    for (i = size - 1; i >= 0; i--) { /* L^-T L^-1 X */
+        for (j = i + 1; j < size; j++)
+            add_scaled(-A[j * size + i], X + j * columns, X + i * columns, columns);
+        for (j = 0; j < columns; j++)
+            X[i * columns + j] /= A[i * size + i];
+    }
+    return 1;
+}
+
+/*{model}*/
+
+/* ------------------------------------------------------------------------------------
+   The local problem: the plan that a step starts from, and its stages.
+   --------------------------------------------------------------------------------- */
+
+enum { INPUTS, DEVIATIONS, INCREMENTS }; /* what R weighs */
+
+/* Weight Q (n, n) of s_{k+1}; that of s_H is the terminal one. */
+static const real *weight_of_stage(int k)
+{
+    if (k == H - 1)
+        return terminal_weight;
+    return state_weights + (GPMPC_STATE_WEIGHTS > 1 ? k : 0) * n * n;
+}
+
+/* Weight R (m, m) of the input of stage k. */
+static const real *input_weight(int k)
+{
+    return input_weights + (GPMPC_INPUT_WEIGHTS > 1 ? k : 0) * m * m;
+}
+
+/* Index of the stage model of stage k: of H, or the one that is held. */
+static int stage_of(int k) { return GPMPC_STAGES > 1 ? k : 0; }
+
+/* The means x_1 .. x_H of the last plan, one step on, in the turn of the state. */
+static real continued_mean(const gpmpc_controller *controller, const real *state,
+                           int k, int i, const int *angles, int count)
+{
+    real mean = controller->means[k + 1 < H ? k + 1 : H][i];
+    int a;
+    for (a = 0; a < count; a++)
+        if (angles[a] == i)
+            mean += whole_turns(state[i] - controller->means[1][i]);
+    return mean;
+}
+
+/* Reads the reference; its angles move by full turns towards the last plan. */
+static void read_reference(gpmpc_controller *controller, const real *state,
+                           const gpmpc_reference *reference)
+{
+    gpmpc_problem *problem = &controller->problem;
+    int k, i, a;
+    for (k = 0; k <= H; k++) {
+        copy(reference->states[k], problem->targets[k], n);
+        for (a = 0; a < GPMPC_COST_ANGLE_COUNT; a++) {
+            real plan;
+            i = cost_angles[a];
+            plan = state[i];
+            if (k > 0 && controller->has_plan)
+                plan = continued_mean(controller, state, k, i, cost_angles,
+                                      GPMPC_COST_ANGLE_COUNT);
+            problem->targets[k][i] += whole_turns(plan - problem->targets[k][i]);
+        }
+    }
+    for (k = 0; k < H; k++)
+        for (i = 0; i < m; i++)
+            problem->target_inputs[k][i] =
+                reference->has_inputs ? reference->inputs[k][i] : 0;
+}
+
+/* The first guess: the last plan, one step on. Without one a line from the state to the
+   last reference, and the previous input. */
+static void guess_plan(gpmpc_controller *controller, const real *state,
+                       const gpmpc_reference *reference)
+{
+    gpmpc_problem *problem = &controller->problem;
+    int k, i;
+    copy(state, problem->states[0], n);
+    for (k = 1; k <= H; k++)
+        for (i = 0; i < n; i++) {
+            real mean;
+            if (GPMPC_STAGES == 1 && GPMPC_HELD)
+                mean = state[i];
+            else if (controller->has_plan)
+                mean = continued_mean(controller, state, k, i, state_angles,
+                                      GPMPC_STATE_ANGLE_COUNT);
+            else
+                mean = problem->targets[k][i]
+                       + (1 - k * ((real)1 / H)) * (state[i] - problem->targets[1][i]);
+            problem->states[k][i] = mean;
+        }
+    for (k = 0; k < H; k++)
+        for (i = 0; i < m; i++) {
+            real input = problem->previous_input[i];
+            if (controller->has_plan)
+                input = controller->inputs[k + 1 < H ? k + 1 : H - 1][i];
+            else if (GPMPC_PENALIZED == DEVIATIONS && !GPMPC_HELD)
+                input = reference->inputs[k][i];
+            if (GPMPC_HELD) {
+                problem->inputs[k][i] = problem->previous_input[i];
+                continue;
+            }
+            input = smaller(larger(input, input_lower[k * m + i]),
+                            input_upper[k * m + i]);
+            if (GPMPC_HAS_RATES) {
+                real last = k > 0 ? problem->inputs[k - 1][i]
+                                  : problem->previous_input[i];
+                input = smaller(larger(input, last + rate_lower[k * m + i]),
+                                last + rate_upper[k * m + i]);
+            }
+            problem->inputs[k][i] = input;
+        }
+}
+
+/* d <- (1 - L) d + L (x - f(x', u')): what the last step showed of a constant error */
+static void estimate_disturbance(gpmpc_controller *controller, const real *state)
+{
+    real mean[GPMPC_STATES];
+    int i, a;
+    if (!controller->has_plan) {
+        fill(controller->disturbance, 0, n);
+        return;
+    }
+    model(controller->means[0], controller->problem.previous_input,
+          controller->problem.model, mean, 0, 0, 0);
+    for (i = 0; i < n; i++) {
+        real error = state[i] - mean[i];
+        for (a = 0; a < GPMPC_STATE_ANGLE_COUNT; a++)
+            if (state_angles[a] == i)
+                error -= whole_turns(error);
+        controller->disturbance[i] +=
+            GPMPC_DISTURBANCE_GAIN * (error - controller->disturbance[i]);
+    }
+}
+
+/* Linearises the dynamics along the plan: c = f(s, u) + d - A s - B u. */
+static void linearize(gpmpc_controller *controller)
+{
+    gpmpc_problem *problem = &controller->problem;
+    real next[GPMPC_STATES];
+    int k, i;
+    for (k = 0; k < GPMPC_STAGES; k++) {
+        const real *s = problem->states[k];
+        const real *u = problem->inputs[k];
+        real *V = 0;
+#if GPMPC_TUBES
+        V = &problem->V[k][0][0];
+#endif
+        model(s, u, problem->model, next, &problem->A[k][0][0], &problem->B[k][0][0],
+              V);
+#if GPMPC_TUBES
+        add_scaled(1, process_noise, V, n * n);
+#endif
+        for (i = 0; i < n; i++) {
+            real after = next[i] + (GPMPC_ESTIMATES ? controller->disturbance[i] : 0);
+            problem->c[k][i] = after - (dot(problem->A[k][i], s, n)
+                                        + dot(problem->B[k][i], u, m));
+        }
+    }
+}
+
+#if GPMPC_INCREMENTAL
+/* The held linearisation as that of the increments since the last step:
+   c = s_0 - A s_{-1} - B u_{-1}, in which a constant error of the model cancels. */
+static void write_increments(gpmpc_controller *controller)
+{
+    gpmpc_problem *problem = &controller->problem;
+    real last[GPMPC_STATES];
+    int i, a;
+    copy(controller->means[0], last, n);
+    for (a = 0; a < GPMPC_STATE_ANGLE_COUNT; a++) {
+        i = state_angles[a];
+        last[i] += whole_turns(problem->states[0][i] - last[i]);
+    }
+    for (i = 0; i < n; i++)
+        problem->c[0][i] = problem->states[0][i] - dot(problem->A[0][i], last, n)
+                           - dot(problem->B[0][i], problem->previous_input, m);
+}
+#endif
+
+#if GPMPC_TUBES || GPMPC_ROLLS_OUT || GPMPC_FEEDBACK_COORDINATES
+/* One stage of the Riccati recursion, from P_{k+1} to P_k (size, size):
+
+     D = R + B'P B,   K = D^-1 B'P A
+     P <- Q + K'R K + (A - B K)' P (A - B K)
+
+   Q is NULL where it is not needed any more. */
+static void riccati(const real *A, const real *B, const real *Q, const real *R,
+                    int size, real *P, real *K, real *D)
+{
+    real PB[GPMPC_AUGMENTED * GPMPC_INPUTS];
+    real closed[GPMPC_AUGMENTED * GPMPC_AUGMENTED];
+    real PC[GPMPC_AUGMENTED * GPMPC_AUGMENTED];
+    real factor[GPMPC_INPUTS * GPMPC_INPUTS];
+    real RK[GPMPC_INPUTS * GPMPC_AUGMENTED];
+    int i, j;
+    product(P, B, size, size, m, PB);
+    copy(R, D, m * m);
+    add_transposed_product(B, PB, size, m, m, D);
+    fill(K, 0, m * size);
+    add_transposed_product(PB, A, size, m, size, K);
+    copy(D, factor, m * m);
+    (void)solve_positive(factor, m, K, size);
+    if (!Q)
+        return;
+    product(B, K, size, m, size, closed);
+    for (i = 0; i < size * size; i++)
+        closed[i] = A[i] - closed[i];
+    product(P, closed, size, size, size, PC);
+    product(R, K, m, m, size, RK);
+    copy(Q, P, size * size);
+    add_transposed_product(closed, PC, size, size, size, P);
+    add_transposed_product(K, RK, m, size, size, P);
+    for (i = 0; i < size; i++) /* symmetric whatever is rounded */
+        for (j = 0; j < i; j++) {
+            real value = (P[i * size + j] + P[j * size + i]) / 2;
+            P[i * size + j] = value;
+            P[j * size + i] = value;
+        }
+}
+#endif
+
+#if GPMPC_TUBES || GPMPC_ROLLS_OUT
+/* Gains K_k of u = u_k - K_k (x - x_k), the regulator of the plan's own stages. */
+static void write_gains(gpmpc_problem *problem)
+{
+    real P[GPMPC_STATES * GPMPC_STATES];
+    real Q[GPMPC_STATES * GPMPC_STATES];
+    real R[GPMPC_INPUTS * GPMPC_INPUTS];
+    real D[GPMPC_INPUTS * GPMPC_INPUTS];
+    int k;
+    if (!GPMPC_FEEDBACK) {
+        fill(&problem->gains[0][0][0], 0, H * m * n);
+        return;
+    }
+    copy(state_weights, Q, n * n);
+    copy(input_weights, R, m * m);
+    copy(terminal_weight, P, n * n);
+#if GPMPC_OUTPUTS
+    for (k = 0; k < n; k++) {
+        add_scaled(1, problem->Z[0][k], Q + k * n, n);
+        add_scaled(1, problem->Z[H - 1][k], P + k * n, n);
+    }
+    for (k = 0; k < m; k++)
+        add_scaled(1, problem->Z[0][n + k] + n, R + k * m, m);
+#endif
+    for (k = H - 1; k >= 0; k--)
+        riccati(&problem->A[stage_of(k)][0][0], &problem->B[stage_of(k)][0][0], Q, R, n,
+                P, &problem->gains[k][0][0], D);
+}
+#endif
+
+#if GPMPC_TUBES
+/* Sigma_{k+1} = (A - B K) Sigma_k (A - B K)' + V */
+static void predict_covariances(gpmpc_problem *problem, const real *start)
+{
+    real closed[GPMPC_STATES * GPMPC_STATES];
+    real spread[GPMPC_STATES * GPMPC_STATES];
+    int k, i, j, l;
+    copy(start, &problem->covariances[0][0][0], n * n);
+    for (k = 0; k < H; k++) {
+        int stage = stage_of(k);
+        for (i = 0; i < n; i++)
+            for (j = 0; j < n; j++) {
+                closed[i * n + j] = problem->A[stage][i][j];
+                for (l = 0; l < m; l++)
+                    closed[i * n + j] -=
+                        problem->B[stage][i][l] * problem->gains[k][l][j];
+            }
+        product(closed, &problem->covariances[k][0][0], n, n, n, spread);
+        for (i = 0; i < n; i++)
+            for (j = 0; j <= i; j++) {
+                real total = (problem->V[stage][i][j] + problem->V[stage][j][i]) / 2;
+                total += dot(spread + i * n, closed + j * n, n);
+                problem->covariances[k + 1][i][j] = total;
+                problem->covariances[k + 1][j][i] = total;
+            }
+    }
+}
+#endif
+
+/* ------------------------------------------------------------------------------------
+   The rows of the states' constraints.
+   --------------------------------------------------------------------------------- */
+
+/* Gradients of row e at stage k by s_{k+1} and by u_k; NULL for zero. */
+#if GPMPC_SMOOTH
+#define ROW_BY_STATE(problem, k, e) ((problem)->E[k][e])
+#define ROW_BY_INPUT(problem, k, e) ((problem)->D[k][e])
+#else
+#define ROW_BY_STATE(problem, k, e) ((void)(k), row_gradients + (e) * n)
+#define ROW_BY_INPUT(problem, k, e) ((const real *)0)
+#endif
+
+/* E s_{k+1} + D u_k */
+static real row_value(const gpmpc_problem *problem, int k, int e, const real *s,
+                      const real *u)
+{
+    const real *by_input = ROW_BY_INPUT(problem, k, e);
+    real value = dot(ROW_BY_STATE(problem, k, e), s, n);
+    (void)problem;
+    return by_input ? value + dot(by_input, u, m) : value;
+}
+
+/* Writes the rows at the plan: smooth ones linearised, bounds moved inwards by
+   kappa sqrt(F Sigma F'). Returns whether all functions are finite. */
+static int write_rows(gpmpc_problem *problem, const gpmpc_reference *reference)
+{
+    int finite = 1;
+    int k, e;
+#if GPMPC_SMOOTH
+    real h[GPMPC_ROWS];
+    for (k = 0; k < H; k++) {
+        copy(row_gradients, &problem->E[k][0][0], r * n);
+        fill(&problem->D[k][0][0], 0, r * m);
+        constraints(problem->states[k + 1], problem->inputs[k],
+                    reference->parameters[k], h, &problem->E[k][0][0],
+                    &problem->D[k][0][0]);
+        for (e = 0; e < r; e++) {
+            problem->row_lower[k][e] = row_lower[k * r + e];
+            problem->row_upper[k][e] = row_upper[k * r + e];
+            if (!row_is_smooth[e])
+                continue;
+            finite = finite && is_finite(h[e]) && all_finite(problem->E[k][e], n)
+                     && all_finite(problem->D[k][e], m);
+            problem->row_upper[k][e] += dot(problem->E[k][e], problem->states[k + 1], n)
+                                        - h[e]
+                                        + dot(problem->D[k][e], problem->inputs[k], m);
+        }
+    }
+#else
+    (void)reference;
+    for (k = 0; k < H; k++)
+        for (e = 0; e < r; e++) {
+            problem->row_lower[k][e] = row_lower[k * r + e];
+            problem->row_upper[k][e] = row_upper[k * r + e];
+        }
+#endif
+#if GPMPC_TUBES
+    for (k = 0; k < H; k++)
+        for (e = 0; e < r; e++) {
+            const real *F = ROW_BY_STATE(problem, k, e);
+            real variance = 0;
+            real margin;
+            int i;
+            for (i = 0; i < n; i++)
+                if (F[i] != 0)
+                    variance += F[i] * dot(problem->covariances[k + 1][i], F, n);
+            margin = row_kappas[e] * SQRT(larger(variance, 0));
+            problem->row_lower[k][e] += margin;
+            problem->row_upper[k][e] -= margin;
+        }
+#endif
+    copy(row_prices, problem->prices, r);
+    return finite;
+}
+
+/* By how much the plan misses a bound of states, inputs or increments, at most. */
+static real largest_violation(const gpmpc_problem *problem)
+{
+    real largest = 0;
+    int k, e, i;
+    for (k = 0; k < H; k++) {
+        const real *u = problem->inputs[k];
+        for (e = 0; e < r; e++) {
+            real value = row_value(problem, k, e, problem->states[k + 1], u);
+            largest = larger(largest, larger(value - problem->row_upper[k][e],
+                                             problem->row_lower[k][e] - value));
+        }
+        for (i = 0; i < m; i++) {
+            largest = larger(largest, larger(u[i] - input_upper[k * m + i],
+                                             input_lower[k * m + i] - u[i]));
+            if (GPMPC_HAS_RATES) {
+                real rate = u[i] - (k > 0 ? problem->inputs[k - 1][i]
+                                          : problem->previous_input[i]);
+                largest = larger(largest, larger(rate - rate_upper[k * m + i],
+                                                 rate_lower[k * m + i] - rate));
+            }
+        }
+    }
+    return largest;
+}
+
+/* Whether the plan keeps the hard rows of the states, nearly. */
+static int keeps_hard_rows(const gpmpc_problem *problem)
+{
+    real total = 0;
+    int k, e;
+    for (k = 0; k < H; k++)
+        for (e = 0; e < r; e++) {
+            real value =
+                row_value(problem, k, e, problem->states[k + 1], problem->inputs[k]);
+            real outside = larger(value - problem->row_upper[k][e],
+                                  problem->row_lower[k][e] - value);
+            if (row_prices[e] > LARGEST && outside > 0)
+                total += outside;
+        }
+    return total <= FEASIBLE;
+}
+
+/* ------------------------------------------------------------------------------------
+   Condensing: the states are eliminated (gpmpc/mpc/_condense.py).
+   --------------------------------------------------------------------------------- */
+
+/* Writes the input's part of the Hessian: 2 R, and its coupling for increments. */
+static void write_input_hessian(gpmpc_program *program)
+{
+    int k, i, j;
+    fill(&program->P[0][0], 0, N * N);
+    for (k = 0; k < H; k++)
+        for (i = 0; i < m; i++)
+            for (j = 0; j < m; j++) {
+                real weight = input_weight(k)[i * m + j];
+                program->P[k * m + i][k * m + j] = 2 * weight;
+                if (GPMPC_PENALIZED != INCREMENTS)
+                    continue;
+                if (k < H - 1)
+                    program->P[k * m + i][k * m + j] +=
+                        2 * input_weight(k + 1)[i * m + j];
+                if (k > 0)
+                    program->P[k * m + i][(k - 1) * m + j] = -2 * weight;
+            }
+}
+
+/* Writes 2 B_k' M_{k+1} for the cost to go without input,
+   M_H = W_H, M_k = W_k + A_k' M_{k+1} A_k. */
+static void write_costs_to_go(gpmpc_problem *problem, gpmpc_program *program)
+{
+    real M[GPMPC_STATES * GPMPC_STATES];
+    real MA[GPMPC_STATES * GPMPC_STATES];
+    int k, i, j, l;
+    (void)program;
+    fill(M, 0, n * n);
+    for (k = H - 1; k >= 0; k--) {
+        const real *A = &problem->A[stage_of(k)][0][0];
+        add_scaled(1, weight_of_stage(k), M, n * n);
+#if GPMPC_OUTPUTS
+        for (i = 0; i < n; i++)
+            add_scaled(1, problem->Z[k][i], M + i * n, n);
+#endif
+        for (j = 0; j < m; j++)
+            for (i = 0; i < n; i++) {
+                real total = 0;
+                for (l = 0; l < n; l++)
+                    total += M[i * n + l] * problem->B[stage_of(k)][l][j];
+                problem->BM[k][j][i] = 2 * total;
+            }
+#if GPMPC_OUTPUTS
+        for (i = 0; i < m; i++) {
+            const real *Z = problem->Z[k][n + i];
+            for (j = 0; j < m; j++) {
+                real total = Z[n + j];
+                for (l = 0; l < n; l++)
+                    total += problem->B[stage_of(k)][l][i] * problem->Z[k][l][n + j];
+                program->P[k * m + i][k * m + j] += 2 * total;
+            }
+            add_scaled(2, Z, problem->BM[k][i], n);
+        }
+#endif
+        product(M, A, n, n, n, MA);
+        fill(M, 0, n * n);
+        add_transposed_product(A, MA, n, n, n, M);
+    }
+}
+
+/* Adds 2 Gamma'W Gamma to P, and writes E Gamma + D to G:
+   Gamma_{k+1} = [A_k Gamma_k, B_k] are the derivatives of s_{k+1} by the inputs. */
+static void add_states(gpmpc_problem *problem, gpmpc_program *program)
+{
+    int k, i, j, e;
+    int now = 0;
+    for (k = 0; k < H; k++) {
+        int before = k * m;
+        int width = before + m;
+        int stage = stage_of(k);
+        for (i = 0; i < n; i++) {
+            real *next = problem->gamma[1 - now][i];
+            fill(next, 0, before);
+            for (j = 0; j < n; j++)
+                add_scaled(problem->A[stage][i][j], problem->gamma[now][j], next,
+                           before);
+            copy(problem->B[stage][i], next + before, m);
+        }
+        now = 1 - now;
+        for (i = 0; i < m; i++)
+            for (j = 0; j < n; j++)
+                add_scaled(problem->BM[k][i][j], problem->gamma[now][j],
+                           program->P[before + i], width);
+        for (e = 0; e < r; e++) {
+            real *row = program->G[GPMPC_RATE_ROWS + k * r + e];
+            const real *by_input = ROW_BY_INPUT(problem, k, e);
+            fill(row, 0, N);
+            for (j = 0; j < n; j++)
+                add_scaled(ROW_BY_STATE(problem, k, e)[j], problem->gamma[now][j], row,
+                           width);
+            if (by_input)
+                add_scaled(1, by_input, row + before, m);
+        }
+    }
+    for (i = 0; i < N; i++)
+        for (j = 0; j < i; j++)
+            program->P[j][i] = program->P[i][j];
+}
+
+/* Writes the bounds of inputs, increments and rows, of which inputs and states are
+   those at v = 0; the first ``unbounded`` constraints have none. */
+static void write_bounds(const gpmpc_problem *problem, const real *inputs,
+                         const real *states, int unbounded, gpmpc_program *program)
+{
+    int k, i, e;
+    int first_rate = unbounded + N;
+    int first_row = first_rate + GPMPC_RATE_ROWS;
+    for (i = 0; i < unbounded; i++) {
+        program->lower[i] = -INFINITY;
+        program->upper[i] = INFINITY;
+    }
+    for (k = 0; k < H; k++) {
+        const real *u = inputs + k * m;
+        for (i = 0; i < m; i++) {
+            program->lower[unbounded + k * m + i] = input_lower[k * m + i] - u[i];
+            program->upper[unbounded + k * m + i] = input_upper[k * m + i] - u[i];
+            if (GPMPC_HAS_RATES) {
+                real last = k > 0 ? inputs[(k - 1) * m + i]
+                                  : problem->previous_input[i];
+                real rate = u[i] - last;
+                program->lower[first_rate + k * m + i] = rate_lower[k * m + i] - rate;
+                program->upper[first_rate + k * m + i] = rate_upper[k * m + i] - rate;
+            }
+        }
+        for (e = 0; e < r; e++) {
+            real value = row_value(problem, k, e, states + (k + 1) * n, u);
+            program->lower[first_row + k * r + e] = problem->row_lower[k][e] - value;
+            program->upper[first_row + k * r + e] = problem->row_upper[k][e] - value;
+        }
+    }
+}
+
+/* Writes q by the adjoint recursion, and the bounds. */
+static void write_gradient(gpmpc_controller *controller)
+{
+    gpmpc_problem *problem = &controller->problem;
+    gpmpc_program *program = &controller->program;
+    real free_states[(GPMPC_HORIZON + 1) * GPMPC_STATES]; /* without input */
+    real no_inputs[GPMPC_SIZE];
+    real error[GPMPC_STATES];
+    real gradient[GPMPC_STATES];
+    real costate[GPMPC_STATES]; /* A_k' times the gradient by s_{k+1} */
+    int k, i, j;
+    copy(problem->states[0], free_states, n);
+    for (k = 0; k < H; k++)
+        for (i = 0; i < n; i++)
+            free_states[(k + 1) * n + i] =
+                problem->c[stage_of(k)][i]
+                + dot(problem->A[stage_of(k)][i], free_states + k * n, n);
+    fill(program->q, 0, N);
+    fill(costate, 0, n);
+    for (k = H - 1; k >= 0; k--) {
+        const real *state = free_states + (k + 1) * n;
+        real *q = program->q + k * m;
+        for (j = 0; j < m; j++) {
+            real centre = 0;
+            if (GPMPC_PENALIZED == DEVIATIONS)
+                centre = problem->target_inputs[k][j];
+            else if (GPMPC_PENALIZED == INCREMENTS && k == 0)
+                centre = problem->previous_input[j];
+            for (i = 0; i < m; i++)
+                q[i] -= 2 * input_weight(k)[i * m + j] * centre;
+        }
+        for (i = 0; i < n; i++)
+            error[i] = state[i] - problem->targets[k + 1][i];
+        multiply(weight_of_stage(k), error, n, n, gradient);
+        for (i = 0; i < n; i++)
+            gradient[i] = 2 * gradient[i] + costate[i];
+#if GPMPC_OUTPUTS
+        for (i = 0; i < n + m; i++) {
+            const real *Z = problem->Z[k][i];
+            real slope = 2 * (dot(Z, state, n) + Z[n + m]);
+            if (i < n)
+                gradient[i] += slope;
+            else
+                q[i - n] += slope;
+        }
+#endif
+        fill(costate, 0, n);
+        for (i = 0; i < n; i++) {
+            add_scaled(gradient[i], problem->A[stage_of(k)][i], costate, n);
+            add_scaled(gradient[i], problem->B[stage_of(k)][i], q, m);
+        }
+    }
+    fill(no_inputs, 0, N);
+    write_bounds(problem, no_inputs, free_states, 0, program);
+}
+
+#if GPMPC_FEEDBACK_COORDINATES
+/* Writes one stage of [s_k - r_k; u_{k-1}; 1] and its weight, of ``size`` entries. */
+static void write_augmented(const gpmpc_problem *problem, int k, int size, real *A,
+                            real *B)
+{
+    int stage = stage_of(k);
+    int e = size - 1;
+    int i, j;
+    fill(A, 0, size * size);
+    fill(B, 0, size * m);
+    for (i = 0; i < n; i++) {
+        real shift = problem->c[stage][i] - problem->targets[k + 1][i];
+        copy(problem->A[stage][i], A + i * size, n);
+        copy(problem->B[stage][i], B + i * m, m);
+        if (k > 0)
+            shift += dot(problem->A[stage][i], problem->targets[k], n);
+        if (GPMPC_PENALIZED == DEVIATIONS)
+            shift += dot(problem->B[stage][i], problem->target_inputs[k], m);
+        A[i * size + e] = shift;
+    }
+    for (i = 0; i < e - n; i++) {
+        B[(n + i) * m + i] = 1;
+        if (GPMPC_PENALIZED == DEVIATIONS)
+            A[(n + i) * size + e] = problem->target_inputs[k][i];
+    }
+    A[e * size + e] = 1;
+    if (GPMPC_PENALIZED == INCREMENTS)
+        for (i = 0; i < size; i++)
+            for (j = 0; j < m; j++)
+                A[i * size + n + j] += B[i * m + j];
+}
+
+/* Writes the weight W (size, size) of the augmented state after stage k. */
+static void write_augmented_weight(const gpmpc_problem *problem, int k, int size,
+                                   real *W)
+{
+    int i;
+    fill(W, 0, size * size);
+    for (i = 0; i < n; i++)
+        copy(weight_of_stage(k) + i * n, W + i * size, n);
+    (void)problem;
+#if GPMPC_OUTPUTS
+    for (i = 0; i < n + m; i++) {
+        const real *Z = problem->Z[k][i];
+        real constant = Z[n + m] + dot(Z, problem->targets[k + 1], n);
+        add_scaled(1, Z, W + i * size, n + m);
+        W[i * size + size - 1] += constant;
+        W[(size - 1) * size + i] += constant;
+    }
+#endif
+}
+
+/* Writes the feedback that is optimal without bounds,
+   u_k = F_k [s_k; u_{k-1}; 1], and half the Hessian of the cost in what is added. */
+static void write_feedback(gpmpc_problem *problem)
+{
+    enum {
+        WITH_INPUT = GPMPC_PENALIZED == INCREMENTS || GPMPC_OUTPUTS,
+        size = GPMPC_STATES + (WITH_INPUT ? GPMPC_INPUTS : 0) + 1
+    };
+    real A[size * size];
+    real B[size * GPMPC_INPUTS];
+    real P[size * size];
+    real W[size * size];
+    real K[GPMPC_INPUTS * size];
+    int k, i;
+    write_augmented_weight(problem, H - 1, size, P);
+    for (k = H - 1; k >= 0; k--) {
+        write_augmented(problem, k, size, A, B);
+        if (k > 0)
+            write_augmented_weight(problem, k - 1, size, W);
+        riccati(A, B, k > 0 ? W : 0, input_weight(k), size, P, K,
+                &problem->hessians[k][0][0]);
+        for (i = 0; i < m; i++) {
+            real *F = problem->feedback[k][i];
+            int j;
+            fill(F, 0, GPMPC_AUGMENTED);
+            for (j = 0; j < size - 1; j++)
+                F[j] = -K[i * size + j];
+            if (GPMPC_PENALIZED == INCREMENTS)
+                F[n + i] += 1;
+            F[n + m] = -K[i * size + size - 1];
+            if (GPMPC_PENALIZED == DEVIATIONS)
+                F[n + m] += problem->target_inputs[k][i];
+            if (k > 0)
+                F[n + m] += dot(K + i * size, problem->targets[k], n);
+        }
+    }
+}
+
+/* Writes the inputs and states of unknowns v. */
+static void expand(const gpmpc_problem *problem, const real *unknowns, real *inputs,
+                   real *states);
+
+/* Writes the program in feedback coordinates: P is block diagonal, q zero, and the
+   bounds of inputs are rows. */
+static void condense_with_feedback(gpmpc_controller *controller)
+{
+    gpmpc_problem *problem = &controller->problem;
+    gpmpc_program *program = &controller->program;
+    real inputs[GPMPC_SIZE];
+    real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
+    real row[GPMPC_SIZE];
+    int k, i, j, e;
+    int now = 0;
+    write_feedback(problem);
+    problem->has_feedback = 1;
+    program->rows = GPMPC_G_ROWS;
+    fill(&program->P[0][0], 0, N * N);
+    fill(&program->G[0][0], 0, GPMPC_G_ROWS * N);
+    fill(program->q, 0, N);
+    fill(&problem->gamma[0][0][0], 0, 2 * (n + m) * N);
+    for (k = 0; k < H; k++) {
+        /* derivatives by v of s_k and u_{k-1}, and of s_{k+1} and u_k */
+        real(*response)[GPMPC_SIZE] = problem->gamma[now];
+        real(*next)[GPMPC_SIZE] = problem->gamma[1 - now];
+        int here = k * m;
+        int width = here + m;
+        for (i = 0; i < m; i++) {
+            for (j = 0; j < m; j++)
+                program->P[here + i][here + j] = 2 * problem->hessians[k][i][j];
+            fill(next[n + i], 0, N);
+            for (j = 0; j < n + m; j++)
+                add_scaled(problem->feedback[k][i][j], response[j], next[n + i], here);
+            next[n + i][here + i] = 1;
+            copy(next[n + i], program->G[here + i], width);
+            if (GPMPC_HAS_RATES)
+                for (j = 0; j < width; j++)
+                    program->G[N + here + i][j] = next[n + i][j] - response[n + i][j];
+        }
+        for (i = 0; i < n; i++) {
+            fill(next[i], 0, N);
+            for (j = 0; j < n; j++)
+                add_scaled(problem->A[stage_of(k)][i][j], response[j], next[i], width);
+            for (j = 0; j < m; j++)
+                add_scaled(problem->B[stage_of(k)][i][j], next[n + j], next[i], width);
+        }
+        for (e = 0; e < r; e++) {
+            const real *by_input = ROW_BY_INPUT(problem, k, e);
+            fill(row, 0, width);
+            for (j = 0; j < n; j++)
+                add_scaled(ROW_BY_STATE(problem, k, e)[j], next[j], row, width);
+            if (by_input)
+                for (j = 0; j < m; j++)
+                    add_scaled(by_input[j], next[n + j], row, width);
+            copy(row, program->G[N + GPMPC_RATE_ROWS + k * r + e], width);
+        }
+        now = 1 - now;
+    }
+    expand(problem, program->q, inputs, states);
+    write_bounds(problem, inputs, states, N, program);
+}
+#endif
+
+/* u_k = F_k [s_k; u_{k-1}; 1] + v_k (or v_k), s_{k+1} = A_k s_k + B_k u_k + c_k */
+static void expand(const gpmpc_problem *problem, const real *unknowns, real *inputs,
+                   real *states)
+{
+    int k, i;
+    copy(problem->states[0], states, n);
+    for (k = 0; k < H; k++) {
+        const real *s = states + k * n;
+        real *u = inputs + k * m;
+        for (i = 0; i < m; i++) {
+            u[i] = unknowns[k * m + i];
+            if (problem->has_feedback) {
+                const real *F = problem->feedback[k][i];
+                const real *last = k > 0 ? inputs + (k - 1) * m
+                                         : problem->previous_input;
+                u[i] += F[n + m] + dot(F, s, n) + dot(F + n, last, m);
+            }
+        }
+        for (i = 0; i < n; i++)
+            states[(k + 1) * n + i] = problem->c[stage_of(k)][i]
+                                      + dot(problem->A[stage_of(k)][i], s, n)
+                                      + dot(problem->B[stage_of(k)][i], u, m);
+    }
+}
+
+/* Makes the quadratic program, in the coordinates that suit it: where A grows over the
+   horizon, P in the inputs spans more digits than a number has. */
+static void condense(gpmpc_controller *controller)
+{
+    gpmpc_problem *problem = &controller->problem;
+    gpmpc_program *program = &controller->program;
+    real growth = 0;
+    int i;
+    problem->has_feedback = 0;
+    program->rows = GPMPC_RATE_ROWS + GPMPC_STATE_ROWS;
+    write_input_hessian(program);
+    fill(&program->G[0][0], 0, GPMPC_RATE_ROWS * N);
+    for (i = 0; i < GPMPC_RATE_ROWS; i++) { /* u_k - u_{k-1} */
+        program->G[i][i] = 1;
+        if (i >= m)
+            program->G[i][i - m] = -1;
+    }
+    write_costs_to_go(problem, program);
+    add_states(problem, program);
+    for (i = 0; i < N; i++) {
+        int last = (H - 1) * m + i % m;
+        growth += program->P[i][i] / program->P[last][last];
+    }
+#if GPMPC_FEEDBACK_COORDINATES
+    if (!(growth <= LARGEST_GROWTH)) {
+        condense_with_feedback(controller);
+        return;
+    }
+#else
+    (void)growth;
+#endif
+    write_gradient(controller);
+}
+
+/*{qp}*/
+
+/* ------------------------------------------------------------------------------------
+   The decision.
+   --------------------------------------------------------------------------------- */
+
+/* What a plan costs: its stages, summed. */
+#if GPMPC_ELASTIC
+static real cost_of_plan(const gpmpc_problem *problem, const real *states,
+                         const real *inputs)
+{
+    real total = 0;
+    int k, i, j;
+    for (k = 0; k < H; k++) {
+        real error[GPMPC_STATES];
+        real v[GPMPC_INPUTS];
+        for (i = 0; i < n; i++)
+            error[i] = states[(k + 1) * n + i] - problem->targets[k + 1][i];
+        for (i = 0; i < n; i++)
+            for (j = 0; j < n; j++)
+                total += error[i] * weight_of_stage(k)[i * n + j] * error[j];
+        for (i = 0; i < m; i++) {
+            v[i] = inputs[k * m + i];
+            if (GPMPC_PENALIZED == DEVIATIONS)
+                v[i] -= problem->target_inputs[k][i];
+            else if (GPMPC_PENALIZED == INCREMENTS)
+                v[i] -= k > 0 ? inputs[(k - 1) * m + i] : problem->previous_input[i];
+        }
+        for (i = 0; i < m; i++)
+            for (j = 0; j < m; j++)
+                total += v[i] * input_weight(k)[i * m + j] * v[j];
+#if GPMPC_OUTPUTS
+        {
+            real z[GPMPC_AUGMENTED];
+            copy(states + (k + 1) * n, z, n);
+            copy(inputs + k * m, z + n, m);
+            z[n + m] = 1;
+            for (i = 0; i <= n + m; i++)
+                total += z[i] * dot(problem->Z[k][i], z, n + m + 1);
+        }
+#endif
+    }
+    return total;
+}
+
+/* Returns the largest violation of an elastic row of a plan. */
+static real elastic_violation(const gpmpc_problem *problem, const real *states,
+                              const real *inputs)
+{
+    real largest = 0;
+    int k, e;
+    for (k = 0; k < H; k++)
+        for (e = 0; e < r; e++) {
+            real value =
+                row_value(problem, k, e, states + (k + 1) * n, inputs + k * m);
+            if (row_is_elastic[e])
+                largest = larger(largest, larger(value - problem->row_upper[k][e],
+                                                 problem->row_lower[k][e] - value));
+        }
+    return largest;
+}
+
+/* Returns the price of elastic rows that cannot be kept (gpmpc/mpc/_elastic.py):
+   with cost J0 and violations V0 of the plan without them,
+   price = 2 (J + ..) / V0,   J0 <= J <= 2 J0 */
+static real elastic_price(const gpmpc_problem *problem, const real *states,
+                          const real *inputs, real last_cost)
+{
+    real free_cost = cost_of_plan(problem, states, inputs);
+    real cost = smaller(larger(free_cost, last_cost), 2 * free_cost);
+    real missed = 0;
+    real beside = 0;
+    int k, e, i;
+    for (k = 0; k < H; k++)
+        for (e = 0; e < r; e++) {
+            const real *g = ROW_BY_STATE(problem, k, e);
+            const real *Q = state_weights + (GPMPC_STATE_WEIGHTS > 1 ? k : 0) * n * n;
+            real value = row_value(problem, k, e, states + (k + 1) * n, inputs + k * m);
+            real outside = larger(value - problem->row_upper[k][e],
+                                  problem->row_lower[k][e] - value);
+            real weight = 0;
+            real square;
+            if (!row_is_elastic[e] || !(outside > 0))
+                continue;
+            for (i = 0; i < n; i++)
+                weight += g[i] * dot(Q + i * n, g, n);
+            square = larger(dot(g, g, n), REAL(1e-12));
+            missed += outside;
+            beside += weight / (square * square) * outside * outside;
+        }
+    return 2 * (cost + beside) / larger(missed, REAL(1e-12));
+}
+
+/* Solves the program once more with another price of the elastic rows, where the first
+   solution misses one of them. */
+static void lower_elastic_prices(gpmpc_controller *controller)
+{
+    static const real next_to_nothing = REAL(1e-9);
+    gpmpc_problem *problem = &controller->problem;
+    gpmpc_solution *solution = &controller->candidate;
+    real inputs[GPMPC_SIZE];
+    real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
+    real last_cost;
+    real price;
+    int e;
+    expand(problem, solution->x, inputs, states);
+    if (!(elastic_violation(problem, states, inputs) > KEPT))
+        return;
+    last_cost = cost_of_plan(problem, &problem->states[0][0], &problem->inputs[0][0]);
+    for (e = 0; e < r; e++)
+        if (row_is_elastic[e])
+            problem->prices[e] = next_to_nothing;
+    controller->elastic = *solution;
+    solve(&controller->program, problem->prices, &controller->elastic,
+          &controller->elastic);
+    expand(problem, controller->elastic.x, inputs, states);
+    price = elastic_price(problem, states, inputs, last_cost);
+    for (e = 0; e < r; e++)
+        if (row_is_elastic[e])
+            problem->prices[e] = price;
+    solve(&controller->program, problem->prices, solution, solution);
+}
+#endif
+
+/* 1/2 x'Px + q'x and the price of violated soft rows. */
+static real objective(const gpmpc_program *program, const real *x)
+{
+    real total = 0;
+    int i, p;
+    for (i = 0; i < N; i++)
+        total += x[i] * (dot(program->P[i], x, N) / 2 + program->q[i]);
+    for (p = N; p < N + program->rows; p++) {
+        real value = dot(program->G[p - N], x, N);
+        real beyond = larger(value - program->upper[p], program->lower[p] - value);
+        if (program->cap[p] < LARGEST && beyond > 0)
+            total += program->cap[p] * beyond;
+    }
+    return total;
+}
+
+/* The largest violation of a hard constraint of the program. */
+static real hard_violation(const gpmpc_program *program, const real *x)
+{
+    real largest = 0;
+    int p;
+    for (p = 0; p < N + program->rows; p++) {
+        real value = p < N ? x[p] : dot(program->G[p - N], x, N);
+        if (program->cap[p] > LARGEST)
+            largest = larger(largest, larger(value - program->upper[p],
+                                             program->lower[p] - value));
+    }
+    return largest;
+}
+
+/* Whether a solution leads to a plan that is no worse than the one before: it was
+   solved, or stopped at the limit at a feasible point that costs no more. */
+static int is_usable(const gpmpc_controller *controller)
+{
+    const gpmpc_problem *problem = &controller->problem;
+    const gpmpc_program *program = &controller->program;
+    const gpmpc_solution *solution = &controller->candidate;
+    real before[GPMPC_SIZE];
+    if (solution->status == GPMPC_SOLVED)
+        return 1;
+    if (solution->status != GPMPC_ITERATION_LIMIT || !all_finite(solution->x, N))
+        return 0;
+    if (!(hard_violation(program, solution->x) <= FEASIBLE))
+        return 0;
+    if (problem->has_feedback)
+        fill(before, 0, N);
+    else
+        copy(&problem->inputs[0][0], before, N);
+    return hard_violation(program, before) > FEASIBLE
+           || objective(program, solution->x) <= objective(program, before);
+}
+
+#if GPMPC_ROLLS_OUT
+/* Rolls the dynamics out towards the plan, u = u' + F (x - x') within its bounds, so
+   that it obeys them; the plan stays where that leads out of the numbers. */
+static void close_defects(gpmpc_controller *controller)
+{
+    gpmpc_problem *problem = &controller->problem;
+    real states[GPMPC_HORIZON + 1][GPMPC_STATES];
+    real inputs[GPMPC_HORIZON][GPMPC_INPUTS];
+    int k, i, j;
+    if (!problem->has_feedback)
+        write_gains(problem);
+    copy(problem->states[0], states[0], n);
+    for (k = 0; k < H; k++) {
+        for (i = 0; i < m; i++) {
+            real last = k > 0 ? inputs[k - 1][i] : problem->previous_input[i];
+            real u = problem->inputs[k][i];
+            for (j = 0; j < n; j++) {
+                real gain = problem->has_feedback ? problem->feedback[k][i][j]
+                                                  : -problem->gains[k][i][j];
+                u += gain * (states[k][j] - problem->states[k][j]);
+            }
+            if (GPMPC_HAS_RATES)
+                u = smaller(larger(u, last + rate_lower[k * m + i]),
+                            last + rate_upper[k * m + i]);
+            inputs[k][i] = smaller(larger(u, input_lower[k * m + i]),
+                                   input_upper[k * m + i]);
+        }
+        model(states[k], inputs[k], problem->model, states[k + 1], 0, 0, 0);
+        for (i = 0; i < n && GPMPC_ESTIMATES; i++)
+            states[k + 1][i] += controller->disturbance[i];
+    }
+    if (!all_finite(&states[0][0], (H + 1) * n))
+        return;
+    copy(&states[0][0], &problem->states[0][0], (H + 1) * n);
+    copy(&inputs[0][0], &problem->inputs[0][0], H * m);
+}
+#endif
+
+/* Decides: makes the problem at the first guess, solves its program, and takes its step
+   whole (the real-time iteration of Diehl, Bock and Schloeder, 2005). Writes plan and
+   violation; returns the status, and whether the plan may be applied. */
+static int decide(gpmpc_controller *controller, const real *state,
+                  const real *covariance, const gpmpc_reference *reference,
+                  int *applicable)
+{
+    gpmpc_problem *problem = &controller->problem;
+    gpmpc_solution *solution = &controller->candidate;
+    int status;
+    *applicable = 0;
+    (void)covariance;
+    copy(controller->has_input ? controller->input : initial_input,
+         problem->previous_input, m);
+    read_reference(controller, state, reference);
+    if (GPMPC_ESTIMATES)
+        estimate_disturbance(controller, state);
+    guess_plan(controller, state, reference);
+    linearize(controller);
+#if GPMPC_OUTPUTS
+    if (!write_outputs(problem, reference))
+        return GPMPC_FUNCTION_NOT_FINITE;
+#endif
+#if GPMPC_TUBES
+    write_gains(problem);
+    predict_covariances(problem, covariance);
+#endif
+#if GPMPC_INCREMENTAL
+    if (controller->has_plan)
+        write_increments(controller);
+#endif
+    if (!write_rows(problem, reference))
+        return GPMPC_FUNCTION_NOT_FINITE;
+    condense(controller);
+    solve(&controller->program, problem->prices, &controller->solution, solution);
+#if GPMPC_ELASTIC
+    if (solution->status == GPMPC_SOLVED)
+        lower_elastic_prices(controller);
+#endif
+    status = solution->status;
+    if (!is_usable(controller))
+        return status;
+    expand(problem, solution->x, &problem->inputs[0][0], &problem->states[0][0]);
+#if GPMPC_ROLLS_OUT
+    close_defects(controller);
+#if GPMPC_SMOOTH
+    (void)write_rows(problem, reference);
+#endif
+#endif
+    *applicable = status == GPMPC_SOLVED || keeps_hard_rows(problem);
+    controller->violation = largest_violation(problem);
+    if (status == GPMPC_SOLVED && controller->violation > KEPT)
+        return GPMPC_SOFT_BOUND_MISSED;
+    return status;
+}
+
+/* ------------------------------------------------------------------------------------
+   The policy: what is applied, whatever happened (gpmpc/mpc/_policy.py).
+   --------------------------------------------------------------------------------- */
+
+/* Puts an input into the box and, among these, within the rates. */
+static void keep_bounds(const gpmpc_controller *controller, real *input)
+{
+    const real *last = controller->has_input ? controller->input : initial_input;
+    int i;
+    for (i = 0; i < m; i++) {
+        if (GPMPC_HAS_RATES)
+            input[i] = smaller(larger(input[i], last[i] + rate_lower[i]),
+                               last[i] + rate_upper[i]);
+        input[i] = smaller(larger(input[i], input_lower[i]), input_upper[i]);
+    }
+}
+
+/* Applies the first of planned inputs (H, m), put onto the bounds that it misses by
+   rounding. Returns whether the plan may be applied. */
+static int admit(gpmpc_controller *controller, real *inputs)
+{
+    const real rounding = REAL(1e-4);
+    real input[GPMPC_INPUTS];
+    int i;
+    copy(inputs, input, m);
+    keep_bounds(controller, input);
+    for (i = 0; i < m; i++) {
+        real miss = absolute(input[i] - inputs[i]);
+        if (!(miss <= rounding * larger(1, absolute(input[i]))))
+            return 0;
+    }
+    if (!all_finite(inputs, H * m))
+        return 0;
+    copy(input, inputs, m);
+    copy(input, controller->input, m);
+    controller->has_input = 1;
+    return 1;
+}
+
+/* Moves the last plan on by a step, the last entry repeated. */
+static int continue_last_plan(gpmpc_controller *controller)
+{
+    int k;
+    if (!controller->has_plan)
+        return 0;
+    for (k = 0; k < H; k++) {
+        copy(controller->means[k + 1], controller->means[k], n);
+        if (k < H - 1)
+            copy(controller->inputs[k + 1], controller->inputs[k], m);
+    }
+    if (GPMPC_HOLDS)
+        copy(controller->input, controller->inputs[0], m);
+    return admit(controller, &controller->inputs[0][0]);
+}
+
+/* Without a plan: the reference's input, or the initial one, within its bounds. */
+static void apply_known_input(gpmpc_controller *controller,
+                              const gpmpc_reference *reference)
+{
+    real input[GPMPC_INPUTS];
+    int known = reference->has_inputs && all_finite(reference->inputs[0], m);
+    copy(known ? reference->inputs[0] : initial_input, input, m);
+    keep_bounds(controller, input);
+    copy(input, controller->input, m);
+    controller->has_input = 1;
+    controller->has_plan = 0;
+    controller->solution.rows = -1;
+}
+
+/* Takes the plan of the step for the one to go on from. Returns whether it may. */
+static int take_plan(gpmpc_controller *controller)
+{
+    gpmpc_problem *problem = &controller->problem;
+    if (!admit(controller, &problem->inputs[0][0]))
+        return 0;
+    copy(&problem->states[0][0], &controller->means[0][0], (H + 1) * n);
+    copy(&problem->inputs[0][0], &controller->inputs[0][0], H * m);
+    controller->solution = controller->candidate;
+    controller->has_plan = 1;
+    return 1;
+}
+
+void gpmpc_reset(gpmpc_controller *controller)
+{
+    controller->has_input = 0;
+    controller->has_plan = 0;
+    controller->failed = 0;
+    controller->status = GPMPC_SOLVED;
+    controller->violation = 0;
+    controller->solution.rows = -1;
+    controller->solution.working = 0;
+    controller->solution.status = GPMPC_SOLVED;
+    fill(controller->disturbance, 0, n);
+}
+
+void gpmpc_hold(gpmpc_reference *reference, const gpmpc_real state[GPMPC_STATES])
+{
+    int k;
+    for (k = 0; k <= H; k++)
+        copy(state, reference->states[k], n);
+    fill(&reference->inputs[0][0], 0, H * m);
+    fill(&reference->parameters[0][0], 0, H * GPMPC_AT_LEAST_ONE(GPMPC_PARAMETERS));
+    reference->has_inputs = 0;
+}
+
+int gpmpc_step_belief(gpmpc_controller *controller, const gpmpc_real mean[GPMPC_STATES],
+                      const gpmpc_real covariance[GPMPC_STATES * GPMPC_STATES],
+                      const gpmpc_reference *reference,
+                      gpmpc_real input[GPMPC_INPUTS])
+{
+    int applicable = 0;
+    int status = GPMPC_INVALID_MEASUREMENT;
+    real disturbance[GPMPC_STATES];
+    copy(controller->disturbance, disturbance, n);
+    if (all_finite(mean, n) && all_finite(covariance, n * n))
+        status = decide(controller, mean, covariance, reference, &applicable);
+    if (applicable && !take_plan(controller)) {
+        applicable = 0;
+        status = GPMPC_NUMERICAL_TROUBLE;
+    }
+    if (!applicable) {
+        copy(disturbance, controller->disturbance, n);
+        if (!continue_last_plan(controller))
+            apply_known_input(controller, reference);
+    }
+    controller->status = status;
+    controller->failed = !applicable;
+    copy(controller->input, input, m);
+    return status;
+}
+
+int gpmpc_step(gpmpc_controller *controller, const gpmpc_real measured[GPMPC_STATES],
+               const gpmpc_reference *reference, gpmpc_real input[GPMPC_INPUTS])
+{
+    static const real certain[GPMPC_STATES * GPMPC_STATES] = {0};
+    return gpmpc_step_belief(controller, measured, certain, reference, input);
+}
+
+unsigned long gpmpc_memory(void) { return (unsigned long)sizeof(gpmpc_controller); }

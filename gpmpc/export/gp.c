@@ -1,0 +1,145 @@
+/* The sums of GPs are taken in double whatever the precision is: a GP of smooth dynamics
+   is a sum of large terms that cancel, of which float would leave two digits. */
+typedef double wide;
+
+/* The exponential without branch and table (Cody and Waite, 1980): x = j ln 2 + y with
+   |y| <= ln(2) / 2, exp(x) = 2^j exp(y), exp(y) = 1 + y + y^2 g(y). Adding ``shift``
+   leaves j in the lowest bits, biased as an exponent is; there 2^j is made of it. */
+static const wide shift = 6755399441056767.0; /* 1.5 * 2^52 + 1023 */
+
+static wide power_of_two(wide shifted)
+{
+    uint64_t bits;
+    wide power;
+    memcpy(&bits, &shifted, sizeof bits);
+    bits <<= 52;
+    memcpy(&power, &bits, sizeof power);
+    return power;
+}
+
+static wide exponential(wide x)
+{
+    wide j, y, g, half;
+    x = x < -750.0 ? -750.0 : x;
+    x = x > 720.0 ? 720.0 : x;
+    j = (x * 1.4426950408889634 + shift) - shift;
+    y = (x - j * 0.6931471805599453) - j * 2.3190468138462996e-17;
+    g = y * 2.510038319586702e-08 + 2.7620085455018414e-07;
+    g = g * y + 2.7557268464831627e-06;
+    g = g * y + 2.4801521302241082e-05;
+    g = g * y + 0.00019841269863050506;
+    g = g * y + 0.001388888891720967;
+    g = g * y + 0.008333333333330063;
+    g = g * y + 0.041666666666624136;
+    g = g * y + 0.16666666666666669;
+    g = g * y + 0.5000000000000001;
+    g = (g * (y * y) + y) + 1.0;
+    /* 2^j in two halves, down to the subnormal numbers */
+    half = j * 0.5 + shift;
+    return g * power_of_two(half) * power_of_two((j - (half - shift)) + shift);
+}
+
+/* Returns start + sum x_i, in eight interleaved parts as registers of eight numbers take
+   it: where large terms cancel, the order of a sum decides its last digits. */
+static wide sum(wide start, const wide *x, int size)
+{
+    wide parts[8] = {0};
+    int whole = size / 8 * 8;
+    int i, lane;
+    for (i = 0; i < whole; i += 8)
+        for (lane = 0; lane < 8; lane++)
+            parts[lane] += x[i + lane];
+    for (i = whole; i < size; i++)
+        parts[i - whole] += x[i];
+    return ((parts[0] + parts[4]) + (parts[2] + parts[6]))
+           + (((parts[1] + parts[5]) + (parts[3] + parts[7])) + start);
+}
+
+/* x'y of long vectors */
+static wide wide_dot(const wide *x, const wide *y, int size)
+{
+    wide parts[8] = {0};
+    wide total;
+    int i, lane;
+    for (i = 0; i + 8 <= size; i += 8)
+        for (lane = 0; lane < 8; lane++)
+            parts[lane] += x[i + lane] * y[i + lane];
+    total = ((parts[0] + parts[4]) + (parts[2] + parts[6]))
+            + ((parts[1] + parts[5]) + (parts[3] + parts[7]));
+    for (; i < size; i++)
+        total += x[i] * y[i];
+    return total;
+}
+
+/* k GPs over the same N points of d features. */
+typedef struct {
+    int points;             /* N */
+    int features;           /* d */
+    int outputs;            /* k */
+    const wide *x;          /* the points, feature after feature (d, N) */
+    const wide *scales;     /* 1 / l^2 (k, d) */
+    const wide *log_signal; /* log sf2 (k,) */
+    const wide *weights;    /* beta (k, N) */
+    const wide *offset;     /* prior means (k,) */
+    const wide *cholesky;   /* lower triangles of K + sn2 I = L L', or NULL */
+} gp_tables;
+
+/* |L^-1 k|^2, by which the points reduce a variance; k is lost */
+static wide variance_reduction(const wide *L, wide *k, int points)
+{
+    wide total = 0;
+    int i;
+    for (i = 0; i < points; i++) {
+        k[i] = (k[i] - wide_dot(L, k, i)) / L[i];
+        total += k[i] * k[i];
+        L += i + 1;
+    }
+    return total;
+}
+
+/* Evaluates the GPs at x~ (d,), their derivatives (k, d) and variances (k,) where they
+   are wanted; ``memory`` is (d + 2, N).
+
+     mean_a = offset_a + sum_i beta_ai k_ai,   k_ai = exp(log sf2_a - |z_i|^2_a / 2)
+     d mean_a / dx~_d = sum_i beta_ai k_ai (x~_id - x~_d) / l_ad^2
+     variance_a = sf2_a - |L_a^-1 k_a|^2 */
+static void gp_evaluate(const gp_tables *gp, const real *query, wide *memory,
+                        real *mean, real *jacobian, real *variance)
+{
+    int count = gp->points;
+    int d = gp->features;
+    wide *differences = memory;
+    wide *kernel = memory + d * count;
+    wide *weighted = kernel + count;
+    int a, i, j;
+    for (j = 0; j < d; j++)
+        for (i = 0; i < count; i++)
+            differences[j * count + i] = gp->x[j * count + i] - query[j];
+    for (a = 0; a < gp->outputs; a++) {
+        wide value;
+        const wide *scales = gp->scales + a * d;
+        const wide *weights = gp->weights + a * count;
+        for (i = 0; i < count; i++)
+            kernel[i] = gp->log_signal[a];
+        for (j = 0; j < d; j++) {
+            const wide *difference = differences + j * count;
+            wide half_scale = scales[j] / 2;
+            for (i = 0; i < count; i++)
+                kernel[i] -= half_scale * (difference[i] * difference[i]);
+        }
+        for (i = 0; i < count; i++)
+            kernel[i] = exponential(kernel[i]);
+        for (i = 0; i < count; i++)
+            weighted[i] = kernel[i] * weights[i];
+        mean[a] = (real)sum(gp->offset[a], weighted, count);
+        for (j = 0; j < d && jacobian; j++)
+            jacobian[a * d + j] =
+                (real)(scales[j] * wide_dot(weighted, differences + j * count, count));
+        if (variance && gp->cholesky) {
+            const wide *L = gp->cholesky + a * (count * (count + 1) / 2);
+            value = exponential(gp->log_signal[a])
+                    - variance_reduction(L, kernel, count);
+            variance[a] = value > 0 ? (real)value : 0;
+        }
+    }
+}

@@ -1,0 +1,77 @@
+/* Numbers that depend on the digits. Each is a power of the rounding unit: in float the
+   same power of a larger one. */
+#if GPMPC_IS_FLOAT
+#define REAL(number) number##f
+#define SQRT sqrtf
+#define EXP expf
+#define LOG logf
+#define SIN sinf
+#define COS cosf
+#define TAN tanf
+#define ATAN atanf
+#define ATAN2 atan2f
+#define TANH tanhf
+#define POW powf
+#define FABS fabsf
+#define ROUND_EVEN rintf
+#define LARGEST FLT_MAX
+#define TINY REAL(1e-37)
+#define UNDEFINED REAL(1e37)
+#define TOLERATED REAL(9e-7)
+#define NEGLIGIBLE REAL(3e-12)
+#define NOISE REAL(9e-7)
+#define LATER REAL(1.4e-5)
+#define FINE REAL(5e-5)
+#define FINEST REAL(2.3e-7)
+#define DOUBT REAL(1.3e-3)
+#define ILL REAL(3.5e-2)
+#define DEPENDENT_SQUARE REAL(5e-6)
+#define DOUBTFUL_SQUARE REAL(1.7e-2)
+#define CANDIDATE_PIVOT REAL(1e-4)
+#define ROUNDING_OF_BOUNDS REAL(2.3e-7)
+#define ROUNDING_OF_SUMS REAL(2e-6)
+#define HOPELESS REAL(8e-4)
+#define NO_RATE REAL(5e-6)
+#define ROW_RESIDUAL REAL(1e-4)
+#define PIVOT_ROUNDING REAL(1.2e-7)
+#define LARGEST_GROWTH REAL(300.0)
+#define KEPT REAL(1e-4) /* by how much a bound may be missed that counts as kept */
+#else
+#define REAL(number) number
+#define SQRT sqrt
+#define EXP exp
+#define LOG log
+#define SIN sin
+#define COS cos
+#define TAN tan
+#define ATAN atan
+#define ATAN2 atan2
+#define TANH tanh
+#define POW pow
+#define FABS fabs
+#define ROUND_EVEN rint
+#define LARGEST DBL_MAX
+#define TINY REAL(1e-300)
+#define UNDEFINED REAL(1e300)
+#define TOLERATED REAL(2e-14)
+#define NEGLIGIBLE REAL(1e-26)
+#define NOISE REAL(2e-14)
+#define LATER REAL(1e-11)
+#define FINE REAL(2e-10)
+#define FINEST REAL(1e-15)
+#define DOUBT REAL(3e-7)
+#define ILL REAL(5e-4)
+#define DEPENDENT_SQUARE REAL(1e-12)
+#define DOUBTFUL_SQUARE REAL(1e-4)
+#define CANDIDATE_PIVOT REAL(1e-9)
+#define ROUNDING_OF_BOUNDS REAL(1e-15)
+#define ROUNDING_OF_SUMS REAL(4e-15)
+#define HOPELESS REAL(1e-7)
+#define NO_RATE REAL(1e-12)
+#define ROW_RESIDUAL REAL(1e-9)
+#define PIVOT_ROUNDING REAL(2.3e-16)
+#define LARGEST_GROWTH REAL(3e7)
+#define KEPT REAL(1e-5)
+#endif
+#define ABSENT REAL(1e20)  /* a bound of this size or more is none */
+#define FEASIBLE REAL(1e-3) /* by how much a suboptimal plan may miss hard bounds */

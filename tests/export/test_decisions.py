@@ -1,0 +1,212 @@
+"""The compiled C decides as Python does."""
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.export import CompiledController, CompiledLoop
+from gpmpc.gaussian import Gaussian
+from gpmpc.gp import GPPosterior
+from gpmpc.models import Affine, DelayedModel, DisturbedModel, ResidualModel
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    ControlLoop,
+    Halfspaces,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+)
+from gpmpc.propagation import Linearization
+from gpmpc.simulation import closed_loop
+from gpmpc.status import Status
+from tests.mpc.small_models import pendulum_posterior
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+COMPILER = ("cc", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic")
+GP = pendulum_posterior()
+WEIGHTS = Tracking([1.0, 0.1], [0.05])
+TORQUES = Box([-2.0], [2.0])
+
+
+def gpmpc(problem, model=GP, horizon=6, propagator=None, **prediction):
+    propagator = Linearization() if propagator is None else propagator
+    return GPMPC(
+        model,
+        propagator,
+        problem,
+        horizon,
+        np.zeros(model.input_dim),
+        prediction=PredictionSettings(**prediction),
+        iterations=1,
+    )
+
+
+def pendulum_with_features():
+    """A residual on a nominal model, seen through sine and cosine of the angle."""
+    generator = torch.Generator().manual_seed(0)
+    states = (2 * torch.rand(30, 2, generator=generator) - 1) * 3.0
+    torques = 2 * torch.rand(30, 1, generator=generator) - 1
+    features = torch.cat(
+        [states[:, :1].sin(), states[:, :1].cos(), states[:, 1:], torques], dim=1
+    )
+    residual = GPPosterior.from_hyperparameters(
+        features,
+        (-0.8 * features[:, :1] - 0.06 * features[:, 2:3]),
+        lengthscales=torch.tensor([[1.5, 1.5, 6.0, 8.0]]),
+        signal_variance=torch.tensor([1.0]),
+        noise_variance=torch.tensor([1e-4]),
+        input_dim=1,
+        predicts="value",
+    )
+    return ResidualModel(
+        nominal=Affine(
+            torch.tensor([[1.0, 0.2], [0.0, 1.0]]),
+            torch.tensor([[0.02], [0.2]]),
+            torch.zeros(2),
+        ),
+        residual=residual,
+        B=torch.tensor([[0.1], [1.0]]),
+        states=[0, 1],
+        inputs=[0],
+        input_dim=1,
+        angles=[0],
+    )
+
+
+def delayed():
+    """Inputs that act one and a half steps late."""
+    model = DelayedModel(pendulum_with_features(), 1.5)
+    problem = Problem(Tracking([1.0, 0.1, 0.0, 0.0], [0.05], angles=[0]), TORQUES)
+    return gpmpc(problem, model, disturbance_gain=0.3)
+
+
+def disturbed():
+    """A disturbance of the rate as a state."""
+    model = DisturbedModel(GP, torch.tensor([[0.0], [1.0]]), [0.01], [0.9])
+    problem = Problem(Tracking([1.0, 0.1, 0.0], [0.05]), TORQUES)
+    return gpmpc(problem, model)
+
+
+def by_stage():
+    """Weights, bounds and rows that differ by stage."""
+    stages = np.linspace(1.0, 2.0, 6)
+    cost = Tracking(
+        stages[:, None, None] * np.diag([1.0, 0.1]),
+        stages[:, None, None] * [[0.05]],
+        terminal=[5.0, 0.5],
+        penalized="inputs",
+    )
+    inputs = Box(-stages[:, None], stages[:, None])
+    rows = Box([-0.5, -1.0], [0.5, 1.0], stages=range(2, 5), penalty=3.0)
+    return gpmpc(Problem(cost, inputs, constraints=[rows]), rolled_out=True)
+
+
+def tube(penalty):
+    """A plane that is kept with 90 %, under rates and process noise."""
+    plane = Halfspaces([[1.0, 0.2]], [0.3], probability=0.9, penalty=penalty)
+    problem = Problem(
+        WEIGHTS, TORQUES, input_rates=Box([-0.8], [0.8]), constraints=[plane]
+    )
+    return gpmpc(problem)
+
+
+CONTROLLERS = {
+    "inputs": lambda: gpmpc(Problem(Tracking([1.0, 0.1], [0.05], penalized="inputs"))),
+    "deviations": lambda: gpmpc(
+        Problem(Tracking([1.0, 0.1], [0.05], penalized="deviations"), TORQUES)
+    ),
+    "elastic tube": lambda: tube("elastic"),
+    "exact tube": lambda: tube("exact"),
+    "hard tube": lambda: tube(None),
+    "velocity form": lambda: gpmpc(Problem(WEIGHTS, TORQUES), form="velocity"),
+    "delay, estimate, angles": delayed,
+    "disturbance as a state": disturbed,
+    "by stage, rolled out": by_stage,
+    "long and unstable": lambda: gpmpc(
+        Problem(Tracking([1.0, 0.1], [1e-8]), TORQUES), horizon=25, covariance="none"
+    ),
+}
+
+
+def questions(controller, steps, seed=0):
+    """Yields measured states of a rough walk, some of them lost, and references."""
+    rng = np.random.default_rng(seed)
+    n = controller.prediction.state_dim
+    H = controller.horizon
+    state = np.zeros(n)
+    for k in range(steps):
+        state = 0.9 * state + rng.normal(0, 0.3, n)
+        measured = state if k % 9 != 5 else np.full(n, np.nan)
+        path = np.zeros((H + 1, n))
+        path[:, 0] = np.sin(0.1 * (k + np.arange(H + 1)))
+        inputs = 0.2 * np.cos(0.1 * (k + np.arange(H)))[:, None]
+        yield measured, Reference(path, inputs)
+
+
+@pytest.mark.parametrize("name", CONTROLLERS)
+def test_decides_as_python(name):
+    controller = CONTROLLERS[name]()
+    python = ControlLoop(controller)
+    compiled = CompiledLoop(controller, compiler=COMPILER)
+    for measured, reference in questions(controller, 60):
+        expected = python.input(measured, reference)
+        got = compiled.input(measured, reference)
+        assert np.abs(got - expected).max() < 1e-9
+        assert python.last is not None
+        assert (compiled.status, compiled.failed) == (
+            python.last.status,
+            python.last.failed,
+        )
+
+
+def test_every_status_is_met():
+    """The rough walk is rough enough for the policy to be asked."""
+    statuses = set()
+    for name in ("elastic tube", "hard tube"):
+        controller = CONTROLLERS[name]()
+        loop = ControlLoop(controller)
+        for measured, reference in questions(controller, 60):
+            loop.input(measured, reference)
+            assert loop.last is not None
+            statuses.add(loop.last.status)
+    assert {
+        Status.SOLVED,
+        Status.INFEASIBLE,
+        Status.SOFT_BOUND_MISSED,
+        Status.INVALID_MEASUREMENT,
+    } <= statuses
+
+
+def test_holds_the_input_where_that_is_asked():
+    controller = tube(None)
+    python = ControlLoop(controller, "hold")
+    compiled = CompiledLoop(controller, on_failure="hold", compiler=COMPILER)
+    for measured, reference in questions(controller, 40):
+        expected = python.input(measured, reference)
+        assert np.abs(compiled.input(measured, reference) - expected).max() < 1e-9
+
+
+def test_float_differs_by_little():
+    controller = tube("exact")
+    python = ControlLoop(controller)
+    compiled = CompiledLoop(controller, precision="float", compiler=COMPILER)
+    for measured, reference in questions(controller, 40):
+        expected = python.input(measured, reference)
+        assert np.abs(compiled.input(measured, reference) - expected).max() < 4e-4
+
+
+def test_flies_in_closed_loop():
+    controller = gpmpc(Problem(WEIGHTS, TORQUES))
+    compiled = CompiledController(controller, compiler=COMPILER)
+    from gpmpc.simulation import ModelLoop
+
+    loop = ModelLoop(GP, Linearization(), time_step=0.2)
+    flights = [
+        closed_loop(loop, flown, [0.5, 0.0], Gaussian.certain(np.zeros(2)), 20)
+        for flown in (controller, compiled)
+    ]
+    assert np.abs(flights[0].inputs - flights[1].inputs).max() < 1e-9
