@@ -11,7 +11,7 @@ from pathlib import Path
 from tests.cli.command import forked
 
 ROOT = Path(__file__).resolve().parents[1]
-BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^```([\w{}-]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 FILE = re.compile(
     r"(?:# @package [\w.]+\n)?(?:#|<!--) ([\w/]+\.(?:py|yaml|xml))(?: -->)?\n"
 )
@@ -22,17 +22,13 @@ def read(path):
     return (ROOT / path).read_text()
 
 
-def follow(path, folder, given="", section=""):
+def follow(path, folder, section=""):
     """Does what a page, or what follows a heading of it, says in a folder.
-
-    Where Python is given that its blocks build upon, its commands are not run; a block
-    with ", ...)" is an excerpt.
 
     Returns:
         The names that its Python leaves, and what each command printed.
     """
     names: dict = {"__name__": "page"}
-    exec(given, names)
     printed = []
     for language, text in BLOCK.findall(
         read(path).partition(section)[2] if section else read(path)
@@ -41,10 +37,8 @@ def follow(path, folder, given="", section=""):
             (folder / written[1]).parent.mkdir(exist_ok=True)
             (folder / written[1]).write_text(text)
         elif language == "python":
-            code = compile(text, path, "exec")
-            if ", ...)" not in text:
-                exec(code, names)
-        elif not language and not given:
+            exec(compile(text, path, "exec"), names)
+        elif not language:
             printed += _run(text, folder)
     return names, printed
 

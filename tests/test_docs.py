@@ -17,28 +17,6 @@ from gpmpc.cli._settings import setting_names, settings
 from tests.pages import BLOCK, ROOT, read
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
-GIVEN = """
-import numpy as np
-import torch
-from gpmpc.gp import Trainer, Transitions, save_posterior
-from gpmpc.mpc import GPMPC, Box, Problem, Tracking
-from gpmpc.propagation import Linearization
-from gpmpc.systems import step, translational
-from gpmpc.trajectories import Elliptical, states_along
-
-plant, rng = translational(), np.random.default_rng(0)
-states = rng.normal(0, 1, (40, 6))
-inputs = [7.26, 0, 0] + rng.normal(0, 0.3, (40, 3)) * [1, 0.3, 0.3]
-next_states = [step(plant, x, u) for x, u in zip(states, inputs, strict=True)]
-transitions = Transitions(states, inputs, next_states)
-gp = Trainer(restarts=0, predicts="difference")(transitions).posterior
-for name in ("gp", "before"):
-    save_posterior(gp, f"{name}.safetensors")
-more, x, u = transitions, transitions.states[0], transitions.inputs[0]
-problem = Problem(Tracking(Q=[1] * 6, R=[1] * 3), inputs=Box([0, -0.7, -0.7]))
-controller = GPMPC(gp, Linearization(), problem, 10, [7.26, 0, 0])
-references = states_along(Elliptical(), np.arange(60.0))
-"""  # what the pages speak of: a plant, transitions, a model, a controller
 
 
 def test_a_newcomers_eleven_tasks_work_from_an_empty_folder(page, tmp_path):
@@ -128,7 +106,7 @@ def test_the_whole_gallery_runs(page, tmp_path):
 def test_the_python_of_a_page_runs_in_its_order(path, page):
     text = read(path)
     assert text.count("```python") > 0
-    page(path, given=GIVEN)
+    page(path)
 
 
 EXAMPLES = [
