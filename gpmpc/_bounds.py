@@ -10,11 +10,18 @@ _RATIO = 300  # bytes a byte of the file; recordings are compressed 2 to 10 time
 
 
 def memory_limit(path: Path) -> int:
-    """Returns the memory that a file's content may take [bytes].
+    """Returns the memory that the content of a file or a folder may take [bytes].
 
     Recordings and logs of this size hold far less.
     """
-    return _LEAST_LIMIT + _RATIO * path.stat().st_size
+    return _LEAST_LIMIT + _RATIO * _size(path)
+
+
+def _size(path: Path) -> int:
+    """Returns the size of a file, or of the files in a folder [bytes]."""
+    if not path.is_dir():
+        return path.stat().st_size
+    return sum(file.stat().st_size for file in path.iterdir() if file.is_file())
 
 
 class MemoryBudget:
@@ -34,7 +41,7 @@ class MemoryBudget:
         """Takes ``size`` bytes for ``what``; ``DataError`` where fewer are left."""
         self.left -= size
         if self.left < 0:
-            file_size = self.path.stat().st_size / 1e6
+            file_size = _size(self.path) / 1e6
             raise DataError(
                 f"{self.path}: {what} would take more than the {self.size / 1e6:.0f} MB"
                 f" that a file of {file_size:.3g} MB may take; a log that is so large"

@@ -1,4 +1,7 @@
-"""Reads MCAP files of any writer: the numbers of each topic's messages, with stamps.
+"""Reads bags in MCAP, of any writer: the numbers of each topic's messages, with stamps.
+
+``Bag`` collects the messages of a bag, in whatever files they are (``_rosbags`` has
+others).
 
 Channels say how their messages are encoded; the file's profile decides nothing. Only
 topics that were asked for are decoded, and what is left out or lost is counted. Chunks
@@ -9,7 +12,7 @@ import struct
 import zlib
 from array import array
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
@@ -110,8 +113,8 @@ class _TopicTable:
 
 
 @dataclass
-class _Channel:
-    """A channel of the file, and how many messages it has."""
+class BagChannel:
+    """A channel of a file, and how many messages it has."""
 
     topic: str
     decode: Decode | None
@@ -127,12 +130,15 @@ def has_own_profile(path: Path) -> bool:
     return head.endswith(_PROFILE)
 
 
-def read_bag(path: Path, options: ReadOptions) -> LogFile | None:
+def read_bag(
+    path: Path, options: ReadOptions, files: Sequence[Path] = ()
+) -> LogFile | None:
     """Reads the topics of a bag: those of ``options``, or all.
 
     Args:
-        path: An MCAP file.
+        path: An MCAP file, or a folder of some.
         options: See ``ReadOptions``.
+        files: Those of a folder.
 
     Returns:
         The tables; None where no topic is named and the file is a recording of this
@@ -141,37 +147,27 @@ def read_bag(path: Path, options: ReadOptions) -> LogFile | None:
     Raises:
         DataError: The file is damaged, or a topic is missing or cannot be read.
     """
-    unseen_flaws = [flaw for flaw in bag_flaws(path) if flaw.kind in _UNSEEN]
-    bag = _Bag(path, options, MemoryBudget(path))
-    try:
-        if not options.partial:
-            _check_counts(unseen_flaws)
-        for record in _records(path, bag.budget, bag.note_damage):
-            bag.add(record)
-            if bag.is_recording:
-                return None
-    except _Damaged as error:
-        raise DataError(
-            f"{path}: the bag cannot be read to its end ({error}); "
-            "partial=true takes what is whole"
-        ) from error
-    bag.check_topics()
-    clocks = choose_times(
-        path=path,
-        columns={name: table.arrays() for name, table in bag.tables.items()},
-        logged={name: table.seconds() for name, table in bag.tables.items()},
-        stamp=options.stamp,
-        topic_by_topic=not options.topics,
-    )
-    tables = {
-        name: table.as_frame(clocks.times[name]) for name, table in bag.tables.items()
-    }
-    findings = [
-        *bag.findings(),
-        *flaw_findings(path, unseen_flaws),
-        *clocks.findings,
-    ]
-    return LogFile(tables, tuple(findings))
+    bag = Bag(path, options, MemoryBudget(path))
+    unseen_flaws: list[Flaw] = []
+    for file in files or [path]:
+        bag.begin_file()
+        flaws = [flaw for flaw in bag_flaws(file) if flaw.kind in _UNSEEN]
+        unseen_flaws += flaws
+        try:
+            if not options.partial:
+                _check_counts(flaws)
+            for record in _records(file, bag.budget, bag.note_damage):
+                bag.add(record)
+                if bag.is_recording:
+                    return None
+        except _Damaged as error:
+            raise DataError(
+                f"{file}: the bag cannot be read to its end ({error}); "
+                "partial=true takes what is whole"
+            ) from error
+    log_file = bag.log_file()
+    findings = (*log_file.findings, *flaw_findings(path, unseen_flaws))
+    return log_file._replace(findings=findings)
 
 
 def _check_counts(flaws: list[Flaw]) -> None:
@@ -182,17 +178,33 @@ def _check_counts(flaws: list[Flaw]) -> None:
 
 
 @dataclass
-class _Bag:
-    """The content of a file, as far as it was read."""
+class Bag:
+    """The content of a bag's files, as far as they were read."""
 
     path: Path
     options: ReadOptions
     budget: MemoryBudget
     schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, _Channel] = field(default_factory=dict)
+    channels: dict[int, BagChannel] = field(default_factory=dict)  # of the present file
+    all_channels: list[BagChannel] = field(default_factory=list)
     tables: dict[str, _TopicTable] = field(default_factory=dict)  # by topic
     damages: Counter[str] = field(default_factory=Counter)  # how often, by their texts
     is_recording: bool = False  # of this package, and no topic is asked for
+
+    def begin_file(self) -> None:
+        """Forgets the numbers of channels and definitions, which each file has anew."""
+        self.schemas = {}
+        self.channels = {}
+
+    def is_asked_for(self, topic: str) -> bool:
+        """Tells whether the messages of a topic are read."""
+        return not self.options.topics or topic in self.options.topics
+
+    def add_channel(self, number: int, channel: BagChannel) -> None:
+        """Adds a channel of the present file."""
+        self.budget.take(_CHANNEL_BYTES, "its channels")
+        self.channels[number] = channel
+        self.all_channels.append(channel)
 
     def note_damage(self, text: str) -> None:
         """Counts what is broken, or raises ``_Damaged`` where all has to be whole."""
@@ -214,33 +226,35 @@ class _Bag:
                 if schema.name == _RECORDING and not any(self.options.topics):
                     self.is_recording = True
             elif kind == Opcode.CHANNEL and number not in self.channels:
-                self.budget.take(_CHANNEL_BYTES, "its channels")
-                self.channels[number] = self._channel(_parsed(Channel, content))
+                self.add_channel(number, self._channel(_parsed(Channel, content)))
         except _Damaged as error:
             self.note_damage(str(error))
 
-    def _channel(self, channel: Channel) -> _Channel:
+    def _channel(self, channel: Channel) -> BagChannel:
         """Finds the decoder of a channel's messages; none if nobody asked for them."""
-        if self.options.topics and channel.topic not in self.options.topics:
-            return _Channel(channel.topic, decode=None)
+        if not self.is_asked_for(channel.topic):
+            return BagChannel(channel.topic, decode=None)
         try:
             schema = self.schemas.get(channel.schema_id)
-            return _Channel(channel.topic, find_decoder(channel, schema, self.budget))
+            decode = find_decoder(channel, schema, self.budget)
+            return BagChannel(channel.topic, decode)
         except UnreadError as error:
-            return _Channel(channel.topic, decode=None, refusal=str(error))
+            return BagChannel(channel.topic, decode=None, refusal=str(error))
 
     def _add_message(self, content: bytes) -> None:
-        """Counts a message, and decodes it if its topic was asked for."""
+        """Adds a message."""
         if len(content) < _MESSAGE.size:
             raise _Damaged("a message is shorter than its head")
         channel_id, _, log_time, _ = _MESSAGE.unpack_from(content)
         if channel_id not in self.channels:
             raise _Damaged(f"a message is of channel {channel_id}, which there is not")
-        channel = self.channels[channel_id]
+        self.add_data(self.channels[channel_id], log_time, content[_MESSAGE.size :])
+
+    def add_data(self, channel: BagChannel, log_time: int, data: bytes) -> None:
+        """Decodes a message that was logged at a time [ns], if its topic is read."""
         channel.messages += 1
         if channel.decode is None:
             return
-        data = content[_MESSAGE.size :]
         self.budget.take(_DECODED_BYTES + _COPIES * len(data), "its messages")
         table = self.tables.setdefault(channel.topic, _TopicTable())
         try:
@@ -259,15 +273,34 @@ class _Bag:
         table.append(log_time, cells, self.budget)
         check_column_count(self.path, len(table.columns), channel.topic)
 
-    def check_topics(self) -> None:
+    def log_file(self) -> LogFile:
+        """Makes the tables of what was read.
+
+        Raises:
+            DataError: A topic that was asked for cannot be read.
+        """
+        self._check_topics()
+        clocks = choose_times(
+            path=self.path,
+            columns={name: table.arrays() for name, table in self.tables.items()},
+            logged={name: table.seconds() for name, table in self.tables.items()},
+            stamp=self.options.stamp,
+            topic_by_topic=not self.options.topics,
+        )
+        tables = {
+            name: table.as_frame(clocks.times[name])
+            for name, table in self.tables.items()
+        }
+        return LogFile(tables, (*self._findings(), *clocks.findings))
+
+    def _check_topics(self) -> None:
         """Raises ``DataError`` where a topic that was asked for cannot be read."""
-        channels = self.channels.values()
-        for channel in channels:
+        for channel in self.all_channels:
             if channel.refusal and channel.topic in self.options.topics:
                 raise DataError(
                     f"{self.path}: topic {channel.topic}: {channel.refusal}"
                 )
-        present = {channel.topic for channel in channels}
+        present = {channel.topic for channel in self.all_channels}
         for topic in self.options.topics:
             if topic in present and topic not in self.tables:
                 raise DataError(f"{self.path}: topic {topic!r} has no message")
@@ -278,7 +311,7 @@ class _Bag:
                     what = "a bag has topics, and the mapping names none for a signal"
                 raise DataError(f"{self.path}: {what}; it has {listed}")
 
-    def findings(self) -> list[Finding]:
+    def _findings(self) -> list[Finding]:
         """Returns what was not read, lost or damaged, with numbers."""
         run = run_name(self.path)
         findings = self._damage_findings(run)
@@ -287,7 +320,7 @@ class _Bag:
             if count:
                 text = f"{count} messages of {topic} cannot be read: left out"
                 findings.append(Finding("malformed message", run, count, text))
-        for channel in self.channels.values():
+        for channel in self.all_channels:
             count = channel.messages
             if channel.refusal and count:
                 text = f"{count} messages of {channel.topic}: {channel.refusal}"
@@ -310,13 +343,14 @@ class _Bag:
     def _unread_findings(self, run: str) -> list[Finding]:
         unread = [
             channel
-            for channel in self.channels.values()
+            for channel in self.all_channels
             if channel.topic not in self.options.topics
         ]
         count = sum(channel.messages for channel in unread)
         if not count:
             return []
-        text = f"{count} messages of {len(unread)} other topics: left out"
+        topics = {channel.topic for channel in unread}
+        text = f"{count} messages of {len(topics)} other topics: left out"
         return [Finding("not asked for", run, count, text)]
 
 

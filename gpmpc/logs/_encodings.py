@@ -13,10 +13,11 @@ from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import GpmpcError
 from gpmpc.logs._file import MOST_COLUMNS, first_line, needs_extra
 from gpmpc.logs._ros2 import LISTED, Cells, Decode, ros2_decoder
+from gpmpc.logs._ros_definitions import idl_as_msg
 
 _Fields = Iterable[tuple[str, Any]]
 _LONGEST = 4 * 2**20  # of a message in JSON or protobuf [bytes]
-READ = "cdr with ros2msg, json, and protobuf are"
+READ = "cdr with ros2msg or ros2idl, json, and protobuf are"
 
 
 class UnreadError(Exception):
@@ -36,6 +37,9 @@ def find_decoder(
     try:
         if message == "cdr" and schema and definition == "ros2msg":
             text = schema.data.decode()
+            return ros2_decoder(schema.name, text, budget)
+        if message == "cdr" and schema and definition == "ros2idl":
+            text = idl_as_msg(schema.name, schema.data.decode())
             return ros2_decoder(schema.name, text, budget)
         if message == "json":
             return _decode_json

@@ -54,7 +54,12 @@ class LogReader(Protocol):
 
 
 def run_name(path: Path) -> str:
-    """Returns the name of the run that a file holds: the file's, without its ending."""
+    """Returns the name of the run that a file holds: the file's, without its ending.
+
+    A folder keeps its whole name.
+    """
+    if path.is_dir():
+        return path.name
     return path.name.removesuffix(".gz").rsplit(".", 1)[0]
 
 

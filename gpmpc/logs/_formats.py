@@ -27,6 +27,7 @@ from gpmpc.logs._mat import read_mat
 from gpmpc.logs._mcap import read_mcap
 from gpmpc.logs._npz import read_npz
 from gpmpc.logs._parquet import read_parquet
+from gpmpc.logs._rosbags import read_bag_folder, read_rosbag
 from gpmpc.logs._ulog import read_ulog
 
 #: by the ending of the file's name
@@ -43,7 +44,25 @@ READERS: dict[str, LogReader] = {
     ".npz": read_npz,
     ".mat": read_mat,
     ".mcap": read_mcap,
+    ".db3": read_rosbag,
+    ".bag": read_rosbag,
     ".ulg": read_ulog,
+}
+
+#: files of others, by their endings, with what makes files of them that are read
+CONVERTERS = {
+    ".bbl": "a blackbox of Betaflight: blackbox_decode makes .csv of it",
+    ".bfl": "a blackbox of Betaflight: blackbox_decode makes .csv of it",
+    ".bin": "a log of ArduPilot, perhaps: mavlogdump.py --format csv --types ATT,IMU "
+    "(of pymavlink) makes .csv of it, one for each type",
+    ".log": "a log of ArduPilot, perhaps: mavlogdump.py --format csv --types ATT,IMU "
+    "(of pymavlink) makes .csv of it, one for each type; rename other texts to .txt",
+    ".tlog": "telemetry of MAVLink: mavlogdump.py --format csv --types ATTITUDE "
+    "(of pymavlink) makes .csv of it, one for each type",
+    ".bag.active": "an unfinished bag of ROS 1: rosbag reindex finishes it",
+    ".xlsx": "a spreadsheet: save it as .csv",
+    ".xls": "a spreadsheet: save it as .csv",
+    ".ods": "a spreadsheet: save it as .csv",
 }
 
 
@@ -66,7 +85,7 @@ def read_file(
         DataError: The file cannot be read, or holds no rows.
     """
     path = Path(path)
-    if not path.is_file():
+    if not path.exists():
         raise DataError(f"{path}: no such file")
     read = _find_reader(path)
     options = ReadOptions(topics=tuple(topics), partial=partial, stamp=stamp)
@@ -90,10 +109,15 @@ def read_file(
 
 
 def _find_reader(path: Path) -> LogReader:
+    if path.is_dir():
+        return read_bag_folder
     name = path.name.lower()
     for ending, reader in READERS.items():
         if name.endswith(ending):
             return reader
+    for ending, advice in CONVERTERS.items():
+        if name.endswith(ending):
+            raise DataError(f"{path}: is {advice}")
     raise DataError(f"{path}: unknown kind of file; known are {', '.join(READERS)}")
 
 

@@ -6,6 +6,7 @@ is read as well: an input of which the states explain most of the variance, line
 teaches nothing of its own.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,10 +39,13 @@ from gpmpc.logs._read_log import read_log
 from gpmpc.logs._row_times import row_times
 
 # columns that hold the time where nobody says which
-TIMES = (STAMP, "timestamp", "t", "time", "stamp", "Time", "seconds", "time_s", "t_s")
-TIMES += tuple(
-    f"{name} {unit}" for name in ("t", "time", "Time") for unit in ("[s]", "(s)")
+TIMES = (STAMP, "timestamp", "t", "time", "stamp", "Time", "seconds")
+# and those whose names say the unit: "Time [ms]", "time (us)", "t_s"; TimeUS is
+# ArduPilot's
+_TIME_WITH_UNIT = re.compile(
+    r"(?:[Tt]ime|[Tt]imestamp|t)(?: ?[\[(](s|ms|us|ns)[\])]|_(s|ms|us|ns))"
 )
+_TIME_US = "TimeUS"
 EVEN = 1e-3  # of its step: a column that rises as evenly may be the time
 DRAWN = 3000  # points of a channel's line
 MOST_DELAYS = 20  # that are listed
@@ -140,7 +144,8 @@ def inspect_log(
         mapping: Says which columns matter, which is the time, and what are states and
             inputs; all numbers by default.
         time: Column of the stamps [s], where there is no mapping; by default one of
-            ``TIMES``, and where there is none, values stand over their rows.
+            ``TIMES`` or with a unit in its name, and where there is none, values stand
+            over their rows.
         time_step: The constant step of rows without stamps [s], likewise.
 
     Raises:
@@ -320,18 +325,32 @@ def _times_of(
     if time_step is not None:
         return _Times(np.arange(len(table), dtype=float) * time_step)
     named = mapping.time if mapping is not None else time
+    unit = mapping.time_unit if mapping is not None else "s"
     number = column_number(table, named)
     if number:
         named = str(table.columns[number - 1])
     if named:
         check_column(str(path), table, named)
-    candidates = [named] if named else [name for name in TIMES if name in table]
-    if not candidates:
+    else:
+        named, unit = _usual_time_column(table)
+    if not named:
         return _Times(np.arange(len(table), dtype=float), are_rows=True)
-    stamps = pd.to_numeric(table[candidates[0]], errors="coerce").to_numpy(float)
-    if mapping is not None:
-        stamps = stamps * TIME_UNITS[mapping.time_unit]
-    return _Times(stamps, column=candidates[0])
+    stamps = pd.to_numeric(table[named], errors="coerce").to_numpy(float)
+    return _Times(stamps * TIME_UNITS[unit], column=named)
+
+
+def _usual_time_column(table: pd.DataFrame) -> tuple[str, str]:
+    """Finds a column that is called as times are, and its unit; empty without one."""
+    for name in TIMES:
+        if name in table:
+            return name, "s"
+    for name in table:
+        match = _TIME_WITH_UNIT.fullmatch(str(name))
+        if match is not None:
+            return name, match[1] or match[2]
+        if name == _TIME_US:
+            return name, "us"
+    return "", "s"
 
 
 def _read_clock(stamps: Array) -> _Clock:

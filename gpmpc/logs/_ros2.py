@@ -1,9 +1,10 @@
-"""Reads the numbers of ROS 2 messages (CDR) by their definitions.
+"""Reads the numbers of ROS messages by their definitions: of ROS 2 (CDR) and ROS 1.
 
 The work is bounded by a message's own bytes: what its definition declares is counted
 before anything is read, and lists of messages are walked over without being kept.
 Sources: the OMG's CDR (DDSI-RTPS 2.5, section 10; DDS-XTYPES 1.3, section 7.4) and
-https://docs.ros.org/en/rolling/Concepts/Basic/About-Interfaces.html.
+https://docs.ros.org/en/rolling/Concepts/Basic/About-Interfaces.html;
+https://wiki.ros.org/msg (ROS 1: the same numbers one after the other, without gaps).
 """
 
 import re
@@ -59,13 +60,16 @@ class _Step(NamedTuple):
         return self.counted or self.length is not None
 
 
-def ros2_decoder(name: str, definition: str, budget: MemoryBudget) -> Decode:
+def ros2_decoder(
+    name: str, definition: str, budget: MemoryBudget, version: int = 2
+) -> Decode:
     """Returns the function that reads the numbers of a message with their paths.
 
     Args:
         name: Of the type, such as "geometry_msgs/msg/Pose".
         definition: Its text with those of the types inside it.
         budget: Of the file; plans and what is walked over are taken from it.
+        version: Of ROS.
 
     Raises:
         ValueError: The definition is not complete, or holds what cannot be read.
@@ -80,7 +84,8 @@ def ros2_decoder(name: str, definition: str, budget: MemoryBudget) -> Decode:
         return plans[type_name]
 
     whole = plan(_short(name))
-    return lambda data: _Message(data, plan, budget).numbers(whole)
+    message = _Message if version == 2 else _PackedMessage
+    return lambda data: message(data, plan, budget).numbers(whole)
 
 
 def _definitions(name: str, text: str) -> dict[str, str]:
@@ -112,6 +117,8 @@ def _parse_definition(type_name: str, text: str) -> list[_Step]:
         if not field:
             raise ValueError(f"the definition of {type_name} has a line {line[:60]!r}")
         kind, _, brackets, at_most, size, field_name = field.groups()
+        if kind == "Header":
+            kind = "std_msgs/Header"
         if kind in ("time", "duration"):
             kind = f"builtin_interfaces/{kind.title()}"
         elif kind not in _CODES and kind not in ("string", "wstring"):
@@ -172,6 +179,8 @@ class _Flattening:
 class _Message:
     """The bytes of a message, and how far they were read."""
 
+    empty_size = 1  # of a message without fields [bytes]
+
     def __init__(
         self, data: bytes, plan: Callable[[str], list[_Step]], budget: MemoryBudget
     ):
@@ -207,7 +216,7 @@ class _Message:
         if step.counted:
             count = self.length()
         if step.type == "empty":
-            self.scalars("B", 1)
+            self.scalars("B", self.empty_size)
             return ()
         if step.type in _CODES:
             return self.scalars(_CODES[step.type], count)
@@ -234,7 +243,7 @@ class _Message:
     def scalars(self, code: str, count: int) -> tuple[float, ...]:
         """Reads ``count`` numbers of one kind; only moves over more than ``LISTED``."""
         size = struct.calcsize(f"={code}")
-        begin = 4 + -(-(self.position - 4) // size) * size if count else self.position
+        begin = self.begin(size) if count else self.position
         end = begin + size * count
         if end > len(self.data):
             raise ValueError(f"it ends after {len(self.data)} bytes, within its fields")
@@ -242,3 +251,26 @@ class _Message:
         if count > LISTED:
             return ()
         return struct.unpack_from(f"{self.order}{count}{code}", self.data, begin)
+
+    def begin(self, size: int) -> int:
+        """Returns where the next number of ``size`` bytes begins."""
+        return 4 + -(-(self.position - 4) // size) * size
+
+
+class _PackedMessage(_Message):
+    """The bytes of a message of ROS 1: without head and gaps."""
+
+    empty_size = 0
+
+    def __init__(
+        self, data: bytes, plan: Callable[[str], list[_Step]], budget: MemoryBudget
+    ):
+        self.data = data
+        self.plan = plan
+        self.budget = budget
+        self.order = "<"
+        self.position = 0
+
+    def begin(self, size: int) -> int:
+        """Returns where the next number begins: behind the one before."""
+        return self.position

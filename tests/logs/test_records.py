@@ -364,3 +364,42 @@ def test_a_wrong_rule_of_a_signal_is_named(signal, text):
     attitude = {"columns": list("abcd"), "kind": "quaternion", "delay": [0, 0, 0, 1]}
     with pytest.raises(SettingError, match="must be one number for an attitude"):
         LogMapping.from_dict({**RAMPS, "states": {"x": attitude}})
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("LOG00001.BBL", "blackbox_decode makes .csv"),
+        ("00000012.BIN", "mavlogdump.py --format csv"),
+        ("flight.tlog", "mavlogdump.py --format csv"),
+        ("flight.log", "rename other texts to .txt"),
+        ("flight.bag.active", "rosbag reindex finishes it"),
+        ("tank.xlsx", "a spreadsheet: save it as .csv"),
+        ("tank.xyz", "unknown kind of file; known are .csv"),
+    ],
+)
+def test_what_is_not_read_says_what_makes_it_readable(tmp_path, name, text):
+    (tmp_path / name).write_bytes(bytes(100))
+    with pytest.raises(DataError, match=text):
+        read_file(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("header", "unit"),
+    [
+        ("loopIteration, time (us), gyroADC[0], motor[0]", 1e6),  # blackbox_decode
+        ("timestamp,TimeUS,Roll,Pitch", 1.0),  # mavlogdump.py
+        ("LineNo,TimeUS,Roll,Pitch", 1e6),
+        ("n;Time [ms];a;b", 1e3),
+        ("n t_s a b", 1.0),
+    ],
+)
+def test_files_of_converters_are_inspected_over_their_times(tmp_path, header, unit):
+    mark = next(mark for mark in ",; " if mark in header)
+    time = 1e-2 * np.arange(50)
+    first = time if header.startswith("timestamp") else np.arange(50)
+    table = np.column_stack([first, time * unit, np.sin(time), np.cos(time)])
+    rows = "\n".join(mark.join(f"{value:.9g}" for value in row) for row in table)
+    (tmp_path / "log.csv").write_text(f"{header}\n{rows}\n")
+    inspection = inspect_log(tmp_path / "log.csv")
+    assert inspection.streams.loc[0, "rate [Hz]"] == pytest.approx(100)
