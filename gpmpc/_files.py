@@ -13,11 +13,16 @@ from gpmpc.exceptions import DataError, SettingError
 
 
 @contextmanager
-def whole_file(path: str | Path) -> Iterator[BinaryIO]:
+def whole_file(path: str | Path, flush: bool = True) -> Iterator[BinaryIO]:
     """Opens a file to be written in one piece or not at all.
 
     The block writes to a neighbour of it, which is flushed to the disk, and renamed if
     no error came. Behind the block both the content and the name are on the disk.
+
+    Args:
+        path: The file.
+        flush: Without it the system writes the file to the disk when it likes. It is
+            whole whenever this process dies; where the machine does, it may be empty.
     """
     path = Path(path)
     partial = path.parent / f".{path.name}.{os.getpid()}.partial"
@@ -25,12 +30,13 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
         with partial.open("wb") as file:
             yield file
             file.flush()
-            os.fsync(file.fileno())
+            if flush:
+                os.fsync(file.fileno())
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
     # on other systems a folder cannot be opened, and needs not be flushed
-    if os.name == "posix":
+    if flush and os.name == "posix":
         folder = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)
@@ -38,11 +44,11 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
             os.close(folder)
 
 
-def write_whole(path: str | Path, content: bytes | str) -> None:
+def write_whole(path: str | Path, content: bytes | str, flush: bool = True) -> None:
     """Writes content to a ``whole_file``."""
     if isinstance(content, str):
         content = content.encode()
-    with whole_file(path) as file:
+    with whole_file(path, flush) as file:
         file.write(content)
 
 

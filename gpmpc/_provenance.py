@@ -268,15 +268,22 @@ def now() -> str:
 
 def versions(packages: Sequence[str] = _PACKAGES) -> dict[str, str | None]:
     """Returns the installed versions by name; None of packages not installed."""
-    installed: dict[str, str | None] = dict.fromkeys(packages)
-    for name in packages:
-        with suppress(PackageNotFoundError):
-            installed[name] = version(name)
-    return installed
+    return {name: _version(name) for name in packages}
 
 
+@cache
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+@cache
 def _git_commit() -> dict | None:
     """Returns the checkout's commit, and whether it has uncommitted changes.
+
+    They are those that this process has found: later ones are not what it runs.
 
     Returns None for an installed package.
     """

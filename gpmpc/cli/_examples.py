@@ -13,7 +13,7 @@ from typing import Any
 
 from gpmpc.cli._chunks import Job
 
-_MOST_OTHERS = 40  # values that are tried beside choices and ends of ranges
+_MOST_OTHERS = 20  # values that are tried beside choices and ends of ranges
 
 
 class Examples:

@@ -163,10 +163,15 @@ class RunFolder:
         """Puts an earlier failure aside and keeps the resolved settings."""
         with suppress(FileNotFoundError):
             os.replace(self.path / ERROR, self.path / _EARLIER_ERROR)
-        write_whole(self.path / CONFIG, config)
+        write_whole(self.path / CONFIG, config, flush=False)
 
     def finish(self, result: Mapping[str, Any]) -> None:
-        """Makes the run a finished one, without a trace of earlier failures."""
+        """Makes the run a finished one, without a trace of earlier failures.
+
+        The settings are on the disk before the result is.
+        """
+        with suppress(FileNotFoundError), open(self.path / CONFIG, "rb+") as config:
+            os.fsync(config.fileno())
         write_whole(self.path / METRICS, json.dumps(result, indent=1) + "\n")
         (self.path / _EARLIER_ERROR).unlink(missing_ok=True)
 

@@ -1,0 +1,76 @@
+"""Measures what a sweep costs beside its flights, and what 100 000 runs cost to read.
+
+    python -m benchmarks.sweeps fly FOLDER           2 000 short flights by joblib
+    python -m benchmarks.sweeps make FOLDER 100000   a sweep that looks finished
+    python -m benchmarks.sweeps read FOLDER          times and memory of reading it
+
+``make`` flies one run, and writes its result under other choices with other numbers,
+as if each had been flown. The folders are for measuring alone: remove them.
+"""
+
+import argparse
+import json
+import os
+import random
+import resource
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+FLIGHT = ["system=double_integrator", "steps=2", "recorder=none"]
+SEEDS = 10  # of every combination of settings
+
+
+def gpmpc(*words: str) -> tuple[str, float, float]:
+    """Runs the command; returns what it printed, time [s] and most memory [MB]."""
+    command = [sys.executable, "-c", "from gpmpc.cli import main; main()", *words]
+    start = time.perf_counter()
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        output = process.stdout.read()
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+    seconds = time.perf_counter() - start
+    if process.returncode:
+        raise SystemExit(f"gpmpc {' '.join(words)}: exit code {process.returncode}")
+    return output, seconds, usage.ru_maxrss / 1024
+
+
+def make(folder: Path, count: int) -> None:
+    """Writes a finished sweep of ``count`` runs over masses and seeds."""
+    gpmpc("run", *FLIGHT, f"folder={folder / 'pattern'}")
+    (pattern,) = (folder / "pattern").glob("*/metrics.json")
+    result = json.loads(pattern.read_text())
+    config = pattern.with_name("config.yaml").read_text()
+    numbers = random.Random(0)
+    tree = folder / "sweep"
+    plan = []
+    for i in range(count):
+        mass, seed = 1 + i // SEEDS / 1000, i % SEEDS
+        choices = sorted([*FLIGHT, f"seed={seed}", f"system.mass={mass}"])
+        plan.append(choices)
+        result["choices"] = choices
+        result["seed"] = result["settings"]["seed"] = seed
+        result["settings"]["system"]["mass"] = mass
+        result["rmse"] = dict.fromkeys(result["rmse"], numbers.lognormvariate(-3, 0.5))
+        path = tree / ",".join(choices)
+        path.mkdir(parents=True)
+        (path / "config.yaml").write_text(config)
+        (path / ".lock").touch()
+        (path / "metrics.json").write_text(json.dumps(result, indent=1) + "\n")
+    (tree / "sweep-0000000000.json").write_text(json.dumps({"runs": plan}))
+
+
+def main() -> None:
+    """Runs one of the three."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("act", choices=["fly", "make", "read"])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("count", type=int, nargs="?", default=2000)
+    arguments = parser.parse_args()
+    if arguments.act == "make":
+        make(arguments.folder, arguments.count)
+
+
+if __name__ == "__main__":
+    main()
