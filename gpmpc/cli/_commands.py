@@ -159,6 +159,18 @@ COMMANDS = {
             _folder("an empty folder, or one to be made (NAME)"),
         ],
     ),
+    "status": Subcommand(
+        "Shows how far the runs of a sweep are, and why some failed",
+        module="_status",
+        arguments=[
+            _argument(
+                "tree",
+                type=Path,
+                metavar="FOLDER",
+                help="of a sweep, or one with sweeps below it",
+            ),
+        ],
+    ),
     "report": Subcommand(
         "Tabulates all runs below a folder; compares two groups of them",
         module="_report",

@@ -45,6 +45,7 @@ _LOCK = ".lock"  # stays, and says who worked on the folder last
 _EARLIER_ERROR = ".error.json"
 _PROBES = 5  # of a lock that may only be looked at by another process
 _PROBE_INTERVAL = 0.01  # between two of them [s]
+_NOT_IN_NAME = re.compile(r"[^a-z0-9_=.,+\-\[\]@]")
 LONGEST_NAME = 150  # characters of a folder's name; file systems take 255 bytes
 
 
@@ -329,12 +330,12 @@ def folder_name(choices: Sequence[str]) -> str:
     Runs of other choices have other names.
     """
     text = ",".join(sorted(choices)) or "default"
-    name = re.sub(r"[^\w=.,+\-\[\]@]", "_", text, flags=re.ASCII)[:LONGEST_NAME]
     # A comma in a choice could be one between two, and names that are equal up to upper
     # and lower case are equal on some file systems.
-    has_comma = any("," in choice for choice in choices)
-    if name == text == text.lower() and not has_comma:
-        return name
+    has_own_commas = text.count(",") > max(0, len(choices) - 1)
+    if len(text) <= LONGEST_NAME and not (has_own_commas or _NOT_IN_NAME.search(text)):
+        return text
+    name = re.sub(r"[^\w=.,+\-\[\]@]", "_", text, flags=re.ASCII)[:LONGEST_NAME]
     digest = hashlib.sha256(json.dumps(sorted(choices)).encode()).hexdigest()
     return f"{name}-{digest[:10]}"
 
