@@ -27,7 +27,7 @@ from gpmpc.cli._settings import folder_of, one_line, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.recording import McapRecorder, RecordedSystem
-from gpmpc.studies._document import plain_text, terminal
+from gpmpc.studies._document import terminal
 from gpmpc.studies._run_folder import (
     RECORDING,
     RunFolder,
@@ -35,6 +35,7 @@ from gpmpc.studies._run_folder import (
     of_other_code,
     record,
 )
+from gpmpc.studies._run_record import warning_of
 from gpmpc.studies.flight import Experiment, metrics, run_trial, summary
 from gpmpc.studies.study import one_thread
 
@@ -131,24 +132,6 @@ def _report_result(
         "of_other_code": bool(other_code),
     }
     return Result(data, _LOST if result.get("lost") else 0)
-
-
-def warning_of(result: Mapping[str, Any]) -> str | None:
-    """Returns in a line that a flight was lost, or suspicious at its end, and why."""
-    lost = result.get("lost")
-    judgement = result.get("judgement")
-    if lost:
-        return plain_text(f"lost: {_since(lost)}")
-    if isinstance(judgement, Mapping) and judgement.get("level") == "suspicious":
-        return plain_text(f"suspicious: {_since(judgement)}")
-    return None
-
-
-def _since(event: Any) -> str:
-    """Returns from which step on, and why, as far as a result tells."""
-    if not isinstance(event, Mapping):
-        return str(event)
-    return f"from step {event.get('step')} on: {event.get('reason')}"
 
 
 def _warning_printer() -> Warn:

@@ -185,6 +185,8 @@ def plain_text(text: object) -> str:
     """Returns a text on one line, with unprintable characters as their escapes."""
     if not isinstance(text, str):
         raise TypeError(f"must be a text; got {text!r:.80}")
+    if text.isprintable():
+        return text
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode() for c in text
     )

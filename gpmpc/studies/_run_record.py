@@ -1,0 +1,263 @@
+"""Tells of one run what a report shows of it, from its ``metrics.json``.
+
+Results may be damaged, or of any other origin: numbers are finite and texts are one
+printable line from here on, and a run that cannot give them raises.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from sys import intern
+from typing import Any, NamedTuple
+
+from gpmpc._provenance import flattened
+from gpmpc.studies._document import plain_text
+from gpmpc.studies._run_folder import ERROR, describe_code
+
+# Whatever the content of a damaged file may raise.
+DAMAGE = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    ArithmeticError,
+    RecursionError,
+)
+
+Choices = dict[str, str]
+Result = Mapping[str, Any]  # content of metrics.json or error.json
+
+
+class Measure(NamedTuple):
+    """A number that runs are tabulated by."""
+
+    #: with its unit; {unit} stands for that of the runs' positions or angles
+    label: str
+    #: takes it from the result of a run; None where the run has none
+    of: Callable[[Result], float | None]
+
+
+def _outside(result: Result) -> float | None:
+    """Returns the steps outside the constraint that was broken most often [%]."""
+    rates = [100 * violation["rate"] for violation in result["violations"].values()]
+    return max(rates, default=None)
+
+
+MEASURES: dict[str, Measure] = {
+    "rmse": Measure("RMSE [{unit}]", lambda result: result["rmse"]["total"]),
+    "outside": Measure("steps outside bounds [%]", _outside),
+    "failed": Measure(
+        "failed solves [%]",
+        lambda result: 100 * sum(result["failures"].values()) / result["steps"],
+    ),
+    "decision": Measure(
+        "decision, median [ms]",
+        lambda result: 1e3 * result["times"]["total"]["median"],
+    ),
+    "training": Measure("training [s]", lambda result: result["times"]["training"]),
+}
+
+
+_COLUMNS = (
+    "state",
+    "folder",
+    "unit",
+    "settings",
+    "origin",
+    "code",
+    "lost",
+    "suspicious",
+    "error",
+)
+
+
+class Settings(Mapping[str, Any]):
+    """Settings by dotted key, as those of another run with some changes.
+
+    Args:
+        base: Those of the other one, with the same keys.
+        changes: What differs.
+    """
+
+    __slots__ = ("base", "changes")
+
+    def __init__(self, base: dict[str, Any], changes: dict[str, Any]):
+        self.base = base
+        self.changes = changes
+
+    def __getitem__(self, key: str) -> Any:
+        return self.changes[key] if key in self.changes else self.base[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.base)
+
+    def __len__(self) -> int:
+        return len(self.base)
+
+
+@dataclass(frozen=True, slots=True)
+class RunRecord:
+    """One run, there or not; see ``Report``."""
+
+    choices: Choices
+    state: str
+    folder: Path | None = None
+    unit: str = ""
+    settings: Settings = field(default_factory=lambda: Settings({}, {}))
+    origin: Mapping[str, str] = field(default_factory=dict)
+    code: str = ""
+    lost: str = ""
+    suspicious: str = ""
+    error: str = ""
+    #: that it was lost, or suspicious at its end, as a sweep says it
+    warning: str = ""
+    #: the version of the code that flew it, in words
+    made_by: str = ""
+    measures: Mapping[str, float | None] = field(default_factory=dict)
+
+    def setting(self, key: str) -> str:
+        """Returns the value of a setting that was not chosen; empty if unknown."""
+        value = self.settings.get(f"options.{key}")
+        if value is None:
+            value = self.settings.get(key, "")
+        if isinstance(value, bool) or value is None:
+            return json.dumps(value)
+        if isinstance(value, int | float | str):
+            return plain_text(str(value))
+        return ""
+
+    def row(self) -> dict[str, Any]:
+        """Returns its columns in ``Report.runs`` but for cell and seed."""
+        columns = {name: getattr(self, name) for name in _COLUMNS}
+        return columns | {name: self.measures.get(name) for name in MEASURES}
+
+
+def read_record(path: Path, content: Result) -> RunRecord:
+    """Returns a run that finished or failed, from the content of its file."""
+    choices = parsed(content["choices"])
+    settings = content["settings"]
+    options = settings.get("options", {}) if isinstance(settings, Mapping) else None
+    if not isinstance(options, Mapping):
+        raise TypeError("settings and their options are not by name")
+    origin = _origin(content)
+    code = _code(content)
+    if path.name == ERROR:
+        return RunRecord(
+            choices=choices,
+            state="failed",
+            folder=path.parent,
+            settings=Settings(flattened(settings), {}),
+            origin=origin,
+            code=code,
+            error=plain_text(content["error"]),
+            made_by=_made_by(content),
+        )
+    measures = {name: measure.of(content) for name, measure in MEASURES.items()}
+    for name, value in measures.items():
+        if value is not None and not _is_finite_number(value):
+            raise ValueError(f"{name}: must be a finite number; got {value!r:.80}")
+    lost = _loss(content)
+    return RunRecord(
+        choices=choices,
+        state="finished",
+        folder=path.parent,
+        unit=plain_text(content["unit"]),
+        settings=Settings(flattened(settings), {}),
+        origin=origin,
+        code=code,
+        lost=lost,
+        suspicious="" if lost else _suspicion(content),
+        warning=warning_of(content) or "",
+        made_by=_made_by(content),
+        measures=measures,
+    )
+
+
+def _is_finite_number(value: Any) -> bool:
+    return type(value) in (int, float) and math.isfinite(value)
+
+
+def _loss(content: Result) -> str:
+    """Returns since when and why a run was lost; empty where it was not."""
+    lost = content.get("lost") or ""
+    if isinstance(lost, Mapping):
+        lost = ", ".join(f"{key} {value}" for key, value in lost.items())
+    return plain_text(str(lost))
+
+
+def _suspicion(content: Result) -> str:
+    """Returns since when and why a run was suspicious at its end, as it tells."""
+    judgement = content.get("judgement") or {}
+    if judgement.get("level") != "suspicious":
+        return ""
+    text = f"step {judgement.get('step')}, reason {judgement.get('reason')}"
+    return plain_text(text)
+
+
+def _origin(content: Result) -> dict[str, str]:
+    """Returns date, commit and machine of a run, as far as it tells them."""
+    provenance = content.get("provenance") or {}
+    git = provenance.get("git") or {}
+    if git:
+        commit = git["commit"][:10]
+        if git.get("dirty"):
+            commit += ", changed"
+    else:
+        commit = (provenance.get("versions") or {}).get("gpmpc")
+    machine = [
+        f"{value} cores" if key == "cores" else str(value)
+        for key, value in (provenance.get("machine") or {}).items()
+    ]
+    origin = {
+        "date": provenance.get("created"),
+        "commit": commit,
+        "machine": ", ".join(machine),
+    }
+    return {key: plain_text(str(value)) for key, value in origin.items() if value}
+
+
+def _code(content: Result) -> str:
+    """Returns a text that differs where the code of two runs differs.
+
+    Older runs tell only their commit or version.
+    """
+    provenance = content.get("provenance") or {}
+    of_gpmpc = provenance.get("code") or describe_code(provenance)
+    of_user = provenance.get("own_code") or {}
+    return plain_text(json.dumps([of_gpmpc, of_user], sort_keys=True))
+
+
+def parsed(choices: Any) -> Choices:
+    """Returns choices, ``key=value`` each, by key."""
+    if not isinstance(choices, list):
+        raise TypeError(f"choices must be a list; got {choices!r:.80}")
+    values = {}
+    for choice in choices:
+        key, _, value = plain_text(choice).partition("=")
+        values[intern(key)] = intern(value)
+    return values
+
+
+def warning_of(result: Result) -> str | None:
+    """Returns in a line that a flight was lost, or suspicious at its end, and why."""
+    lost = result.get("lost")
+    judgement = result.get("judgement")
+    if lost:
+        return plain_text(f"lost: {_since(lost)}")
+    if isinstance(judgement, Mapping) and judgement.get("level") == "suspicious":
+        return plain_text(f"suspicious: {_since(judgement)}")
+    return None
+
+
+def _since(event: Any) -> str:
+    """Returns from which step on, and why, as far as a result tells."""
+    if not isinstance(event, Mapping):
+        return str(event)
+    return f"from step {event.get('step')} on: {event.get('reason')}"
+
+
+def _made_by(content: Result) -> str:
+    return plain_text(describe_code(content.get("provenance") or {}))
