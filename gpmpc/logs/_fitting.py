@@ -28,6 +28,7 @@ _EVALUATIONS = 15
 _COUNTED_STEPS = 8  # steps of a rollout whose errors count
 _BATCH = 40_000  # states of one batch of rollouts: parameter vectors times windows
 _BLOCK = 4  # consecutive windows whose errors are correlated
+_FIRST_TIME_CONSTANT = 0.03  # [s] of a first-order lag, at which the search begins
 _DIVERGED = 1e6  # residual of a rollout that is not finite
 
 
@@ -72,7 +73,9 @@ def fit_nominal(
     if theta0.shape != (count,):
         raise ShapeError(f"theta0 must have {count} entries; got {theta0.shape}")
     windows = log.windows(steps, past=max(model.past, PAST), most=_WINDOWS)
-    if not count:
+    lags = len(model.time_constants)
+    theta0 = np.concatenate([theta0, np.full(lags, _FIRST_TIME_CONSTANT)])
+    if not len(theta0):
         return NominalFit(replace(model, theta=theta0), standard_errors=theta0)
     residuals = _RolloutResiduals(model, windows, steps)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -90,10 +93,12 @@ def fit_nominal(
             max_nfev=_EVALUATIONS,
         )
     theta = solution.x
+    time_constants = np.maximum(theta[count:], 0.0)
     standard_errors = _standard_errors(
         J=residuals.jacobian(theta), residuals=residuals.of_windows(theta[None])[0]
     )
-    return NominalFit(replace(model, theta=theta), standard_errors)
+    fitted = replace(model, theta=theta[:count], time_constants=time_constants)
+    return NominalFit(fitted, standard_errors[:count])
 
 
 class _RolloutResiduals:

@@ -26,6 +26,8 @@ from gpmpc.models._windows import Windows
 _STEPS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # whose errors are explained
 _WINDOWS = 2000  # of a fold, whose errors count
 _LINEARIZED = 200  # of a fold, along which rollouts are linearised: these are slow
+_LINEARIZED_WITH_MEMORY = 60  # likewise of models with many entries to carry on
+_STRIDE_WITH_MEMORY = 8  # of the windows that are linearised of these
 _DIFFERENCE = 1e-6
 # Both are multiples of the time T of the longest prediction.
 _FORGETTING = 6.0  # time constant with which the weight of an earlier error decays
@@ -44,7 +46,10 @@ def error_variances(
         steps: After the starts.
     """
     variances = np.concatenate([noise.outputs.ravel(), noise.measurement])
-    return _responses(model, windows, steps) @ variances
+    stride = 1 if model.memory.empty else _STRIDE_WITH_MEMORY
+    # Neighbours respond alike.
+    responses = _responses(model, windows[::stride], steps)
+    return np.repeat(responses @ variances, stride, axis=0)[: len(windows)]
 
 
 def follow_errors(
@@ -134,15 +139,10 @@ def _fold_errors(
     model: LogModel, log: Log, steps: Sequence[int], longest: int
 ) -> _FoldErrors:
     """Computes the errors of a fold, and its responses to the sources of noise."""
-    past = max(model.past, PAST)
-    windows = log.windows(longest, past=past, most=_WINDOWS)
-    stride = -(-len(windows) // _LINEARIZED)
-    states = windows.states[:, past]
-    next_states = windows.states[:, past + 1]
-    inputs = windows.inputs[:, past - model.lag]
-    modelled = model.outputs(states, inputs, windows.context[:, past])
-    modelled = modelled + model.disturbance(windows)
-    measured = model.kinematics.outputs(states, next_states, windows.time_step)
+    windows = log.windows(longest, past=max(model.past, PAST), most=_WINDOWS)
+    linearized = _LINEARIZED if model.memory.empty else _LINEARIZED_WITH_MEMORY
+    stride = -(-len(windows) // linearized)
+    measured, modelled = model.first_outputs(windows)
     return _FoldErrors(
         squared=np.square(model.rollout_errors(windows, steps)),
         responses=_responses(model, windows[::stride], steps),
@@ -176,70 +176,93 @@ def _sharing_rows(model: LogModel, factor: Array, residuals: Array) -> Array:
 def _responses(model: LogModel, windows: Windows, steps: Sequence[int]) -> Array:
     """Computes the variances of errors by a unit variance of every source.
 
+    One pass from the last step to the first carries the derivatives of the state at
+    each of the steps by what the model carries on, and sums what each source adds.
+
     Returns:
         (W, steps, e, sources), the sources those of the outputs by time constant, then
         the measurements.
     """
-    A, B = _linearized_rollout(model, windows, max(steps))
     W = len(windows)
-    e = A.shape[-1]
-    o = B.shape[-1]
+    e = windows.space.error_dim
+    o = len(model.kinematics.output_names)
+    disturbance = model.disturbance(windows)
+    carried = model.rollout_carried(windows, max(steps))
+    E = carried.shape[-1] - windows.space.dim + e
+    by_start = np.zeros((W, len(steps), e, E))
+    tails = np.zeros((len(TIME_CONSTANTS), W, len(steps), e, o))
+    sums = np.zeros_like(tails)
+    rhos = [
+        np.exp(-windows.time_step / max(constant, 1e-9)) for constant in TIME_CONSTANTS
+    ]
+    for k in range(max(steps) - 1, -1, -1):
+        A, B = _linearized_step(model, windows, k, carried[:, k], disturbance)
+        for s, step in enumerate(steps):
+            if step == k + 1:
+                by_start[:, s] = np.eye(e, E)
+        flat = by_start.reshape(W, -1, E)
+        G = (flat @ B).reshape(W, len(steps), e, o)
+        by_start = (flat @ A).reshape(by_start.shape)
+        for t, rho in enumerate(rhos):  # the sum over i, j of rho^|i - j| G_i G_j
+            sums[t] += G * (G + 2 * tails[t])
+            tails[t] = rho * (tails[t] + G)
     output_sources = len(TIME_CONSTANTS) * o
     responses = np.empty((W, len(steps), e, output_sources + e))
-    for s, step in enumerate(steps):
-        by_start = np.broadcast_to(np.eye(e), (W, e, e))
-        by_output = np.empty((step, W, e, o))
-        for i in range(step - 1, -1, -1):
-            by_output[i] = by_start @ B[:, i]
-            by_start = by_start @ A[:, i]
-        for t, constant in enumerate(TIME_CONSTANTS):
-            rho = np.exp(-windows.time_step / max(constant, 1e-9))
-            columns = slice(t * o, (t + 1) * o)
-            responses[:, s, :, columns] = _coloured_sum(by_output, rho)
-        responses[:, s, :, output_sources:] = np.square(by_start) + np.eye(e)
+    for t, total in enumerate(sums):
+        responses[..., t * o : (t + 1) * o] = total
+    responses[..., output_sources:] = np.square(by_start[..., :e]) + np.eye(e)
     return responses
 
 
-def _coloured_sum(G: Array, rho: float) -> Array:
-    """Computes the sum over i, j of rho^|i - j| G_i G_j (W, e, o), in one pass."""
-    tail = np.zeros(G.shape[1:])
-    total = np.zeros(G.shape[1:])
-    for g in G:
-        total += g * (g + 2 * tail)
-        tail = rho * (tail + g)
-    return total
-
-
-def _linearized_rollout(
-    model: LogModel, windows: Windows, steps: int
+def _linearized_step(
+    model: LogModel, windows: Windows, k: int, carried: Array, disturbance: Array
 ) -> tuple[Array, Array]:
-    """Linearises the steps of rollouts by forward differences.
+    """Linearises a step of rollouts by forward differences.
+
+    Args:
+        model: Whose step it is.
+        windows: W of them, which have the inputs and the context.
+        k: Number of the step.
+        carried: States with all that is carried on, before it (W, n + ...).
+        disturbance: Of the outputs (W, o).
 
     Returns:
-        Derivatives of each step by the state (W, K, e, e) and by the outputs
-        (W, K, e, o).
+        Derivatives by the state and what is carried on (W, E, E), and by the outputs
+        (W, E, o).
     """
     space = windows.space
-    kinematics = model.kinematics
-    dt = windows.time_step
-    start = windows.past - model.lag
-    predicted = model.rollout(windows, steps)
-    first = windows.states[:, windows.past : windows.past + 1]
-    x = np.concatenate([first, predicted[:, :-1]], axis=1)
-    u = windows.inputs[:, start : start + steps]
-    c = windows.context[:, windows.past][:, None]
-    c = np.broadcast_to(c, (*x.shape[:-1], c.shape[-1]))
-    d = model.disturbance(windows)[:, None]
-    y = model.outputs(x, u, c) + d
-    after = kinematics.step(x, y, dt)
-    by_state = []
-    for h in _DIFFERENCE * np.eye(space.error_dim):
-        displaced = space.displace(x, h)
-        displaced_outputs = model.outputs(displaced, u, c) + d
-        displaced_after = kinematics.step(displaced, displaced_outputs, dt)
-        by_state.append(space.difference(displaced_after, after) / _DIFFERENCE)
-    by_output = []
-    for h in _DIFFERENCE * np.eye(y.shape[-1]):
-        displaced_after = kinematics.step(x, y + h, dt)
-        by_output.append(space.difference(displaced_after, after) / _DIFFERENCE)
-    return np.stack(by_state, axis=-1), np.stack(by_output, axis=-1)
+    n = space.dim
+    e = space.error_dim
+    E = carried.shape[-1] - n + e
+    o = disturbance.shape[-1]
+    by_state = _DIFFERENCE * np.eye(E + o, E)[:, None]
+    by_output = np.zeros((E + o, 1, o))
+    by_output[E:, 0] = _DIFFERENCE * np.eye(o)
+    displaced = np.concatenate(
+        [
+            space.displace(carried[:, :n], by_state[..., :e]),
+            carried[:, n:] + by_state[..., e:],
+        ],
+        axis=-1,
+    )
+
+    def step(carried: Array, disturbance: Array) -> Array:
+        return model.step(
+            carried,
+            inputs=windows.inputs[:, windows.past + k],
+            context=windows.context[:, windows.past],
+            time_step=windows.time_step,
+            disturbance=disturbance,
+        )
+
+    after = step(carried, disturbance)
+    displaced_after = step(displaced, disturbance + by_output)
+    changes = np.concatenate(
+        [
+            space.difference(displaced_after[..., :n], after[:, :n]),
+            displaced_after[..., n:] - after[:, n:],
+        ],
+        axis=-1,
+    )
+    J = np.moveaxis(changes / _DIFFERENCE, 0, -1)
+    return J[..., :E], J[..., E:]

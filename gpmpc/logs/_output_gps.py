@@ -13,6 +13,7 @@ from gpmpc.gp import Trainer, standardize
 from gpmpc.gp._data_checks import Columns
 from gpmpc.logs._log import Log
 from gpmpc.models._log_model import LogModel, OutputGP
+from gpmpc.models._windows import Windows
 
 
 def train_output_gp(
@@ -59,27 +60,37 @@ def _mean_residuals(model: LogModel, log: Log, rows: int) -> tuple[Array, Array]
 
     The features are those of the row in the middle.
     """
-    kinematics = model.kinematics
-    windows = log.windows(rows, past=model.lag)
+    windows = log.windows(rows, past=model.past)
     start = windows.past
-    states = windows.states[:, start : start + rows]
+    window_rows = slice(start, start + rows)
+    states = windows.states[:, window_rows]
     next_states = windows.states[:, start + 1 : start + rows + 1]
-    first_input = start - model.lag
-    inputs = windows.inputs[:, first_input : first_input + rows]
+    inputs, _ = model.acting_inputs(windows, window_rows)
     context = windows.context[:, -1:]
     context = np.broadcast_to(context, (*states.shape[:-1], context.shape[-1]))
-    if kinematics.space.angles:  # these may turn by more than half a turn
-        outputs = kinematics.outputs(states, next_states, windows.time_step)
-        measured = outputs.mean(axis=1)
-    else:
-        duration = windows.time_step * rows
-        measured = kinematics.outputs(states[:, 0], next_states[:, -1], duration)
-    nominal = model.nominal.outputs(model.theta, states, inputs, context).mean(axis=1)
-    middle = rows // 2
-    features = kinematics.features(
-        states[:, middle], inputs[:, middle], context[:, middle]
-    )
-    return features, measured - nominal
+    kinematics = model.kinematics
+    outputs = kinematics.outputs(states, next_states, windows.time_step)
+    nominal = model.nominal_outputs(states, inputs, context)
+    residuals = outputs - nominal
+    features = kinematics.features(states, inputs, context)
+    linear = 0.0
+    if model.weights.size:
+        linear = _linear_term(model, windows, features, residuals)
+    residuals = (residuals - linear).mean(axis=1)
+    return features[:, rows // 2], residuals
+
+
+def _linear_term(
+    model: LogModel, windows: Windows, features: Array, residuals: Array
+) -> Array:
+    """Computes the linear term (N, rows, o) along rows that were measured."""
+    remembered = model.parts(model.recall(windows), windows.inputs.shape[-1]).memory
+    terms = []
+    for k in range(features.shape[1]):
+        regressors = model.memory.regressors(features[:, k], remembered)
+        terms.append(regressors @ model.weights.T)
+        remembered = model.memory.step(remembered, features[:, k], residuals[:, k])
+    return np.stack(terms, axis=1)
 
 
 def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:

@@ -20,14 +20,15 @@ import numpy as np
 from gpmpc._dynamics import Array
 from gpmpc.logs._baselines import CONSTANT_STATE, baseline_errors
 from gpmpc.logs._comparison import Comparison, compare
-from gpmpc.logs._fitting import PAST, NominalFit, fit_least_squares, fit_nominal
+from gpmpc.logs._fit_form import fit_from
+from gpmpc.logs._fitting import NominalFit
 from gpmpc.logs._folds import Fold
 from gpmpc.logs._log import Log
 from gpmpc.logs._noise import fit_noise
 from gpmpc.logs._output_gps import train_output_gp
 from gpmpc.logs._smoothing import smooth
 from gpmpc.logs._structures import (
-    LATE,
+    MOST_PAST,
     Candidate,
     GroupGP,
     Structure,
@@ -41,7 +42,7 @@ from gpmpc.models._log_model import LogModel, OutputGP
 from gpmpc.models._parametric import AffineNominal
 from gpmpc.models._windows import Windows
 
-PAST_ROWS = PAST + LATE  # of the windows that structures are compared on
+PAST_ROWS = MOST_PAST  # of the windows that structures are compared on
 _AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
 _JUDGED = (1, 10, 50)  # steps whose errors decide
 _PIECE = 0.02  # of the score that every piece of a structure has to earn
@@ -184,6 +185,16 @@ class Search:
         )
         return _TrainingData(smoothed, start_filter)
 
+    def _training_of(self, structure: Structure) -> list["_TrainingData"]:
+        """Returns what a structure is fitted to, by fold.
+
+        A memory filters the noise of the rows by itself: it is fitted to them as they
+        are.
+        """
+        if structure.model.memory.empty:
+            return self._training
+        return [_TrainingData(fold.train, None) for fold in self._folds]
+
     # 1. nominal structures
 
     def _search_nominals(self) -> None:
@@ -219,23 +230,29 @@ class Search:
 
     def _consider_nominal(self, structure: Structure, parent: Structure | None) -> None:
         """Considers a nominal structure, fitted from the parameters of another."""
+        rows = self._training_of(structure)
         if structure.key not in self._memory:
             starts = [structure.model] * len(self._folds)
             if parent is not None:
                 starts = self._nominal_models[parent.key]
             fits = [
-                fit_from(start, structure.model, training.log, self._steps).model
-                for start, training in zip(starts, self._training, strict=True)
+                fit_from(
+                    start_from=start,
+                    model=structure.model,
+                    log=training.log,
+                    steps=self._steps,
+                    same_log=parent is not None,
+                ).model
+                for start, training in zip(starts, rows, strict=True)
             ]
-            self._memory[structure.key] = [model.theta.tolist() for model in fits]
+            self._memory[structure.key] = [model.parameters for model in fits]
         models = [
             replace(
-                structure.model,
-                theta=np.array(theta, dtype=float),
+                structure.model.with_parameters(parameters),
                 start_filter=training.start_filter,
             )
-            for theta, training in zip(
-                self._memory[structure.key], self._training, strict=True
+            for parameters, training in zip(
+                self._memory[structure.key], rows, strict=True
             )
         ]
         self._nominal_models[structure.key] = models
@@ -294,7 +311,7 @@ class Search:
         models = [model for model in by_fold if model is not None]
         if len(models) < len(by_fold):
             return None
-        structure = Structure(base="", model=models[0], parts=parts)
+        structure = Structure("", models[0], parts[0][0].inputs, parts=parts)
         self._nominal_models[structure.key] = models
         self._enter(structure, self._mean_errors(models))
         return structure
@@ -344,14 +361,7 @@ class Search:
         """
         windows = self._windows[0]
         model = self._nominal_models[structure.key][0]
-        start = windows.past
-        states = windows.states[:, start]
-        measured = model.kinematics.outputs(
-            states, windows.states[:, start + 1], windows.time_step
-        )
-        modelled = model.outputs(
-            states, windows.inputs[:, start - model.lag], windows.context[:, start]
-        )
+        measured, modelled = model.first_outputs(windows)
         residual = np.abs(measured - modelled).max(axis=0)
         is_left = residual > _NOTHING * np.abs(measured).max(axis=0)
         groups = model.kinematics.output_groups
@@ -514,7 +524,9 @@ class Search:
             nominals = self._nominal_models[structure.nominal.key]
             self._gps[key] = [
                 self._train(gp, model, training.log)
-                for model, training in zip(nominals, self._training, strict=True)
+                for model, training in zip(
+                    nominals, self._training_of(structure), strict=True
+                )
             ]
         return self._gps[key]
 
@@ -584,7 +596,9 @@ class Search:
     def fit_to_all_runs(self) -> NominalFit:
         """Fits the best structure to all runs, its GPs and its correction as well."""
         best = self.best
-        training = self._training_data(self._log)
+        training = _TrainingData(self._log, None)
+        if best.model.memory.empty:
+            training = self._training_data(self._log)
         fit = self._fit_nominal_to(training.log, best.nominal)
         gps = tuple(self._train(gp, fit.model, training.log) for gp in best.gps)
         model = replace(fit.model, gps=gps, start_filter=training.start_filter)
@@ -658,14 +672,20 @@ def combine_models(
         models: Without GPs, of the same kinematics.
         groups: Names of the groups of outputs that come from each.
     """
-    if len({model.lag for model in models}) > 1:
+    forms = {(model.lag, model.memory, len(model.time_constants)) for model in models}
+    if len(forms) > 1 or len(models[0].time_constants):
         return None
     names = models[0].kinematics.output_groups
     outputs = [tuple(i for name in own for i in names[name]) for own in groups]
     history = list(models[0].history)
+    weights = models[0].weights.copy()
+    without_nominal: list[int] = []
     for model, indices in zip(models, outputs, strict=True):
+        without_nominal += [i for i in indices if i in model.without_nominal]
         for i in indices:
             history[i] = model.history[i]
+        if len(weights):
+            weights[list(indices)] = model.weights[list(indices)]
     return replace(
         models[0],
         nominal=GroupedNominal(
@@ -675,27 +695,6 @@ def combine_models(
         ),
         theta=np.concatenate([model.theta for model in models]),
         history=tuple(history),
+        weights=weights,
+        without_nominal=tuple(without_nominal),
     )
-
-
-def fit_from(start_from: LogModel, model: LogModel, log: Log, steps: int) -> NominalFit:
-    """Fits the nominal part of a model.
-
-    Args:
-        start_from: The search begins at the parameters that this fitted model has in
-            common with the other.
-        model: The model, whose parameters are not known yet.
-        log: The data.
-        steps: Of the rollouts.
-    """
-    nominal = model.nominal
-    if isinstance(nominal, AffineNominal) and nominal.fitted:
-        # It is linear in its many parameters.
-        fitted = fit_least_squares(nominal.kinematics, log)
-        fitted = replace(fitted, history=model.history)
-        return NominalFit(fitted, standard_errors=np.empty(0))
-    names = start_from.nominal.parameter_names
-    fitted_values = dict(zip(names, start_from.theta, strict=False))
-    defaults = zip(nominal.parameter_names, nominal.start, strict=True)
-    theta0 = np.array([fitted_values.get(name, value) for name, value in defaults])
-    return fit_nominal(model, theta0, log, steps)

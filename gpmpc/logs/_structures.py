@@ -27,12 +27,23 @@ from gpmpc.logs._fitting import PAST
 from gpmpc.logs._log import Log
 from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
 from gpmpc.models._log_model import LogModel
+from gpmpc.models._memory import Memory
 from gpmpc.models._parametric import AffineNominal, MultirotorNominal
 
 LATE = 3  # rows by which motors may act late
 # Rows over which the residuals before a start are averaged to a disturbance: all of the
 # past that windows are cut with.
 DISTURBANCE_ROWS = PAST
+#: what models may remember, by its key and in words
+_MEMORIES = {
+    "rows_and_means": (
+        "3 past rows and means",
+        Memory(3, (0.75, 0.9, 0.95), (0.0, 0.5, 0.8, 0.95)),
+    ),
+    "rows8": ("8 past rows", Memory(8, (), (0.0, 0.5, 0.8, 0.95))),
+}
+# Rows before a start that any structure needs.
+MOST_PAST = max(PAST, *(memory.reach for _, memory in _MEMORIES.values())) + LATE + 1
 
 
 @dataclass(frozen=True)
@@ -68,6 +79,7 @@ class Structure:
 
     base: str  #: that it grew from, such as "rigid body"
     model: LogModel  #: nominal part, history and lag
+    inputs: int  #: number of inputs
     additions: tuple[Addition, ...] = ()
     gps: tuple[GroupGP, ...] = ()
     #: structures without GPs, each with the groups of outputs that are its own; none of
@@ -134,8 +146,9 @@ def _words(names: Sequence[str]) -> str:
 def bases(log: Log) -> list[Structure]:
     """Returns the structures that a search begins with, all of which are tried."""
     if log.mapping.model == "rigid_body":
-        return [_multirotor_base(log), *_affine_bases(RigidBodyKinematics(log.space))]
-    return _affine_bases(Increments(log.space))
+        body = RigidBodyKinematics(log.space)
+        return [_multirotor_base(log), *_affine_bases(body, len(log.input_names))]
+    return _affine_bases(Increments(log.space), len(log.input_names))
 
 
 def _multirotor_base(log: Log) -> Structure:
@@ -150,10 +163,10 @@ def _multirotor_base(log: Log) -> Structure:
         theta=np.empty(0),
         history=(0,) * 6,
     )
-    return Structure("rigid body", model)
+    return Structure("rigid body", model, len(log.input_names))
 
 
-def _affine_bases(kinematics: Kinematics) -> list[Structure]:
+def _affine_bases(kinematics: Kinematics, inputs: int) -> list[Structure]:
     """Returns outputs of zero, and outputs that are affine in the features."""
     names = {False: "constant state", True: "least squares"}
     if isinstance(kinematics, RigidBodyKinematics):
@@ -167,6 +180,7 @@ def _affine_bases(kinematics: Kinematics) -> list[Structure]:
                 theta=np.empty(0),
                 history=(0,) * len(kinematics.output_names),
             ),
+            inputs,
         )
         for fitted, name in names.items()
     ]
@@ -176,9 +190,16 @@ def additions(structure: Structure) -> tuple[Addition, ...]:
     """Returns what a structure may grow by; each is tried on what did best so far."""
     if structure.parts:
         return ()
+    lags = Addition(
+        key="first_order_lags",
+        words="first-order lags",
+        extend=_with_lags(structure.inputs),
+        for_control=False,
+    )
     if isinstance(structure.model.nominal, MultirotorNominal):
-        return _MULTIROTOR_ADDITIONS
-    return _AFFINE_ADDITIONS
+        alone = _alone_additions(structure.model)
+        return (*_MULTIROTOR_ADDITIONS, *_MEMORY_ADDITIONS, lags, *alone)
+    return (*_AFFINE_ADDITIONS, *_MEMORY_ADDITIONS, lags)
 
 
 def _median_voltage(log: Log) -> float:
@@ -189,14 +210,71 @@ def _median_voltage(log: Log) -> float:
     return float(np.median(np.concatenate([run.context[:, 0] for run in log])))
 
 
-def _with_disturbance(model: LogModel) -> LogModel:
+def _with_memory(memory: Memory) -> Callable[[LogModel], LogModel | None]:
+    def extend(model: LogModel) -> LogModel | None:
+        nominal = model.nominal
+        if not model.memory.empty:
+            return None
+        if isinstance(nominal, AffineNominal) and nominal.fitted:
+            return None  # the linear term has it all
+        no_history = (0,) * len(model.history)
+        return replace(model, nominal=nominal, memory=memory, history=no_history)
+
+    return extend
+
+
+_MEMORY_ADDITIONS = tuple(
+    Addition(key, words, _with_memory(memory), for_control=False)
+    for key, (words, memory) in _MEMORIES.items()
+)
+
+
+def _alone_additions(model: LogModel) -> tuple[Addition, ...]:
+    """Returns one addition a group: past rows alone predict it, without the physics."""
+    return tuple(
+        Addition(
+            key=f"alone:{name}",
+            words=f"{name} by past rows alone",
+            extend=_alone(outputs),
+            for_control=False,
+        )
+        for name, outputs in model.kinematics.output_groups.items()
+    )
+
+
+def _alone(outputs: tuple[int, ...]) -> Callable[[LogModel], LogModel | None]:
+    def extend(model: LogModel) -> LogModel | None:
+        if model.memory.empty or set(outputs) <= set(model.without_nominal):
+            return None
+        without = tuple(sorted({*model.without_nominal, *outputs}))
+        return replace(model, without_nominal=without)
+
+    return extend
+
+
+def _with_lags(inputs: int) -> Callable[[LogModel], LogModel | None]:
+    def extend(model: LogModel) -> LogModel | None:
+        nominal = model.nominal
+        is_affine = isinstance(nominal, AffineNominal)
+        if len(model.time_constants) or (is_affine and not nominal.fitted):
+            return None
+        return replace(model, time_constants=np.zeros(inputs))
+
+    return extend
+
+
+def _with_disturbance(model: LogModel) -> LogModel | None:
+    if not model.memory.empty:
+        return None
     return replace(model, history=(DISTURBANCE_ROWS,) * len(model.history))
 
 
 _AFFINE_ADDITIONS = (Addition("disturbance", "disturbance", _with_disturbance),)
 
 
-def _with_force_disturbance(model: LogModel) -> LogModel:
+def _with_force_disturbance(model: LogModel) -> LogModel | None:
+    if not model.memory.empty:
+        return None
     return replace(model, history=(DISTURBANCE_ROWS,) * 3 + (0,) * 3)
 
 
@@ -215,7 +293,7 @@ def _with_late_inputs(model: LogModel) -> LogModel | None:
 
 
 def _with_torque_disturbance(model: LogModel) -> LogModel | None:
-    if not _multirotor(model).torque:
+    if not _multirotor(model).torque or not model.memory.empty:
         return None
     return replace(model, history=model.history[:3] + (DISTURBANCE_ROWS,) * 3)
 

@@ -53,8 +53,10 @@ class LogDynamics:
 
     def __post_init__(self) -> None:
         reason = ""
-        if self.model.lag:
-            reason = f"has inputs that act {self.model.lag} rows late"
+        if self.model.lag or len(self.model.time_constants):
+            reason = "has inputs that act late"
+        elif not self.model.memory.empty:
+            reason = "remembers past rows"
         elif getattr(self.model.nominal, "feedback", False):
             reason = "holds the feedback of the controller that flew"
         if reason:

@@ -1,26 +1,31 @@
 """Models of outputs that kinematics turn into movements, and their rollouts.
 
-    y[k] = nominal(theta; x[k], u[k - lag], c) + gp(x[k], u[k - lag], c) + d
+    y[k] = nominal(theta; x[k], v[k], c) + W r(x[k], v[k], c, s[k]) + gp + d
     x[k+1] = kinematics.step(x[k], y[k])
 
-A correction may add to the states that were rolled out what the past says of them.
-Many windows, many steps and many parameter vectors are rolled out in one batch. The
-disturbance d of an output is the mean, over the last rows before a prediction, of the
-measured output minus the model's; it is held through the prediction. So is the context
-c: a battery's voltage reacts to the inputs, and its future is not known.
+v are the inputs as they act: late by some rows and through first-order lags
+(``_actuators``). s is what the model remembers of past rows (``_memory``), r the
+regressors of its linear term. A correction may add to the states that were rolled out
+what the past says of them. Many windows, many steps and many parameter vectors are
+rolled out in one batch. The disturbance d of an output is the mean, over the last rows
+before a prediction, of the measured output minus the model's; it is held through the
+prediction. So is the context c: a battery's voltage reacts to the inputs, and its
+future is not known.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
+from gpmpc.models._actuators import FirstOrderLags
 from gpmpc.models._correction import LAGS, Correction, StartFilter
 from gpmpc.models._kinematics import Kinematics
+from gpmpc.models._memory import NO_MEMORY, Memory
 from gpmpc.models._parametric import ParametricNominal
 from gpmpc.models._roll_out import iterate
 from gpmpc.models._windows import Windows
@@ -35,6 +40,8 @@ class OutputGP:
     outputs: tuple[int, ...]  #: indices of these outputs (k,)
     #: of the features, with ``predicts="value"`` and no inputs of its own
     posterior: GPPosterior
+    #: whether it sees the regressors of the model's memory in the place of the features
+    sees_memory: bool = False
 
     def mean(self, features: Array) -> Array:
         """Computes the means (..., k) at features (..., d)."""
@@ -44,12 +51,22 @@ class OutputGP:
         return mean.reshape(*features.shape[:-1], -1)
 
 
+class StateParts(NamedTuple):
+    """The parts of a state with all that a model carries on beside it."""
+
+    states: Array  # x (..., n)
+    lagged: Array  # of first-order lags (..., m); (..., 0) without them
+    pending: Array  # inputs on their way, the oldest first (..., D m)
+    memory: Array  # s (..., s)
+
+
 @dataclass(frozen=True)
 class LogModel:
-    """A model of the outputs behind a log: a nominal part and GPs on its residual.
+    """A model of the outputs behind a log: a nominal part and what is learned on it.
 
     Raises:
-        SettingError: ``history`` has another number of outputs.
+        SettingError: ``history`` has another number of outputs, or there is one beside
+            a memory, whose means of outputs take its place.
     """
 
     kinematics: Kinematics  #: how the outputs move a state
@@ -63,44 +80,151 @@ class LogModel:
     correction: Correction | None = None
     #: estimates the starts of rollouts from noisy rows; none where they have no noise
     start_filter: StartFilter | None = None
+    #: of the first-order lags through which the inputs act [s] (m,); empty without
+    time_constants: Array = field(default_factory=lambda: np.empty(0))
+    memory: Memory = NO_MEMORY  #: of past rows
+    #: W of the linear term (o, r), or many of them (T, o, r) that are rolled out beside
+    #: each other; zero where it is empty
+    weights: Array = field(default_factory=lambda: np.empty((0, 0)))
+    #: outputs to which the nominal part does not add
+    without_nominal: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         o = len(self.kinematics.output_names)
         if len(self.history) != o:
             raise SettingError("history", f"must have {o} numbers; got {self.history}")
+        if any(self.history) and not self.memory.empty:
+            rule = "must be zero beside a memory, which takes its place"
+            raise SettingError("history", f"{rule}; got {self.history}")
 
     @property
     def past(self) -> int:
         """Number of rows that a prediction needs before its start."""
-        past = max(self.history) + self.lag
+        rows = max(*self.history, self.memory.reach)
+        rows += self.lag + bool(len(self.time_constants))
         if self.correction is None and self.start_filter is None:
-            return past
-        return max(past, *LAGS)
+            return rows
+        return max(rows, *LAGS)
 
     def outputs(
-        self, states: Array, inputs: Array, context: Array, theta: Any = None
+        self,
+        states: Array,
+        inputs: Array,
+        context: Array,
+        theta: Any = None,
+        memory: Array | None = None,
     ) -> Array:
         """Computes the outputs (..., o) without disturbance.
 
         Args:
             states: (..., n).
-            inputs: (..., m), those that act.
+            inputs: (..., m), as they act.
             context: (..., c).
             theta: Parameters, one array each, instead of the model's own.
+            memory: What is remembered (..., s); it may be left out where nothing is.
         """
-        if theta is None:
-            theta = self.theta
-        nominal = self.nominal.outputs(theta, states, inputs, context)
-        if not self.gps:
-            return nominal
-        batch = states.shape[:-1]
-        inputs = np.broadcast_to(inputs, (*batch, inputs.shape[-1]))
+        if memory is None:
+            memory = np.empty((*states.shape[:-1], 0))
+        nominal = self.nominal_outputs(states, inputs, context, theta)
+        return nominal + self.learned_outputs(states, inputs, context, memory)
+
+    def carried_dim(self, input_dim: int, context_dim: int = 0) -> int:
+        """Returns the number of entries that are carried on beside a state."""
+        lagged = len(self.time_constants)
+        return lagged + self.lag * input_dim + self._memory_dim(input_dim, context_dim)
+
+    def _memory_dim(self, input_dim: int, context_dim: int) -> int:
+        """Returns the number of remembered numbers, s."""
+        if self.memory.empty:
+            return 0
+        features = self.features(
+            self.kinematics.space.origin, np.zeros(input_dim), np.zeros(context_dim)
+        )
+        return self.memory.dim(len(features), len(self.history))
+
+    def parts(self, carried: Array, input_dim: int) -> StateParts:
+        """Takes states with all that is carried on (..., n + ...) apart."""
+        n = self.kinematics.space.dim
+        lagged_end = n + len(self.time_constants)
+        pending_end = lagged_end + self.lag * input_dim
+        return StateParts(
+            states=carried[..., :n],
+            lagged=carried[..., n:lagged_end],
+            pending=carried[..., lagged_end:pending_end],
+            memory=carried[..., pending_end:],
+        )
+
+    def step(
+        self,
+        carried: Array,
+        inputs: Array,
+        context: Array,
+        time_step: float,
+        disturbance: Array | float = 0.0,
+        theta: Any = None,
+        time_constants: Any = None,
+    ) -> Array:
+        """Moves states, with all that is carried on beside them, by a time step.
+
+        Args:
+            carried: States and what is carried on (..., n + ...); see ``parts``.
+            inputs: Those that are commanded now (..., m).
+            context: (..., c).
+            time_step: [s].
+            disturbance: Added to the outputs (..., o).
+            theta: Parameters, one array each, instead of the model's own.
+            time_constants: Of the inputs (..., m) [s], instead of the model's own.
+        """
+        m = inputs.shape[-1]
+        parts = self.parts(carried, m)
+        batch = carried.shape[:-1]
+        inputs = np.broadcast_to(inputs, (*batch, m))
         context = np.broadcast_to(context, (*batch, context.shape[-1]))
-        features = self.kinematics.features(states, inputs, context)
-        y = nominal.copy()
-        for gp in self.gps:
-            y[..., list(gp.outputs)] += gp.mean(features)
-        return y
+        queue = np.concatenate([parts.pending, inputs], axis=-1)
+        acting = queue[..., :m]
+        lagged = parts.lagged
+        if len(self.time_constants):
+            if time_constants is None:
+                time_constants = self.time_constants
+            lags = FirstOrderLags.of(time_constants, time_step)
+            delayed = acting
+            acting = lags.acting(lagged, delayed)
+            lagged = lags.after(lagged, delayed)
+        memory = parts.memory
+        states = parts.states
+        learned = self.learned_outputs(states, acting, context, memory) + disturbance
+        outputs = self.nominal_outputs(states, acting, context, theta) + learned
+        after = self.kinematics.step(states, outputs, time_step)
+        if not self.memory.empty:
+            features = self.features(states, acting, context)
+            learned = np.broadcast_to(learned, outputs.shape)
+            memory = self.memory.step(memory, features, learned)
+        return np.concatenate([after, lagged, queue[..., m:], memory], axis=-1)
+
+    def acting_inputs(
+        self, windows: Windows, rows: slice, time_constants: Any = None
+    ) -> tuple[Array, Array]:
+        """Computes what acts in the rows of windows, from rest at the first row.
+
+        Args:
+            windows: Of W.
+            rows: That are wanted; they begin at ``lag`` or later.
+            time_constants: As in ``step``, one for each input (T, 1, m), to compute
+                many side by side.
+
+        Returns:
+            The inputs as they act (..., W, rows, m), and the state of the first-order
+            lags after the last one (..., W, m); (..., W, 0) without them.
+        """
+        delayed = windows.inputs[:, : rows.stop - self.lag]
+        if not len(self.time_constants):
+            acting = delayed[:, rows.start - self.lag :]
+            return acting, np.empty((len(windows), 0))
+        if time_constants is None:
+            time_constants = self.time_constants
+        lags = FirstOrderLags.of(time_constants, windows.time_step)
+        acting, lagged = lags.filter(delayed)
+        return acting[..., rows.start - self.lag :, :], lagged
 
     def disturbance(self, windows: Windows, theta: Any = None) -> Array:
         """Estimates the disturbances (..., W, o) at the starts of windows.
@@ -109,26 +233,114 @@ class LogModel:
             windows: With ``past`` rows before their starts.
             theta: Parameters, one array (..., 1) each, instead of the model's own.
         """
+        theta, time_constants = self._split(theta)
+        return self._disturbance(windows, theta, time_constants)
+
+    def _disturbance(self, windows: Windows, theta: Any, time_constants: Any) -> Array:
+        disturbance = np.zeros((len(windows), len(self.history)))
+        if not any(self.history):
+            return disturbance
+        longest = max(self.history)
+        first = windows.past - longest
         if theta is not None:
             theta = [np.asarray(parameter)[..., None] for parameter in theta]
-        disturbance = np.zeros((len(windows), len(self.history)))
+        residual = self._residuals(
+            windows, slice(first, windows.past), theta, time_constants
+        )
         for rows in sorted({rows for rows in self.history if rows}):
             is_averaged = np.array(self.history) == rows
-            residual = self._mean_residual(windows, rows, theta)
-            disturbance = disturbance + np.where(is_averaged, residual, 0.0)
+            mean = residual[..., longest - rows :, :].mean(axis=-2)
+            disturbance = disturbance + np.where(is_averaged, mean, 0.0)
         return disturbance
 
-    def _mean_residual(self, windows: Windows, rows: int, theta: Any) -> Array:
-        """Averages measured minus modelled outputs (..., W, o) over the last rows."""
-        start = windows.past
-        first = start - rows
-        states = windows.states[:, first:start]
-        next_states = windows.states[:, first + 1 : start + 1]
-        inputs = windows.inputs[:, first - self.lag : start - self.lag]
-        context = windows.context[:, first:start]
+    def _residuals(
+        self, windows: Windows, rows: slice, theta: Any, time_constants: Any
+    ) -> Array:
+        """Computes measured minus modelled outputs (..., W, rows, o), without memory."""
+        states = windows.states[:, rows]
+        next_states = windows.states[:, rows.start + 1 : rows.stop + 1]
+        inputs, _ = self.acting_inputs(windows, rows, time_constants)
+        context = windows.context[:, rows]
         modelled = self.outputs(states, inputs, context, theta)
         measured = self.kinematics.outputs(states, next_states, windows.time_step)
-        return measured.mean(axis=-2) - modelled.mean(axis=-2)
+        return measured - modelled
+
+    def first_outputs(self, windows: Windows) -> tuple[Array, Array]:
+        """Returns the outputs that follow the starts of windows (W, o).
+
+        They are measured, and modelled with the disturbance.
+        """
+        start = windows.past
+        states = windows.states[:, start]
+        next_states = windows.states[:, start + 1]
+        unfiltered = replace(self, start_filter=None)
+        predicted = unfiltered.rollout_carried(windows, 1)[:, 1, : states.shape[-1]]
+        outputs = self.kinematics.outputs
+        return (
+            outputs(states, next_states, windows.time_step),
+            outputs(states, predicted, windows.time_step),
+        )
+
+    def _split(self, theta: Any) -> tuple[Any, Any]:
+        """Splits parameter vectors into those of the nominal part and the lags'.
+
+        Args:
+            theta: One array each; None for the model's own.
+        """
+        lags = len(self.time_constants)
+        if theta is None or not lags:
+            return theta, None
+        return theta[:-lags], np.stack(theta[-lags:], axis=-1)
+
+    def recall(self, windows: Windows, theta: Any = None) -> Array:
+        """Returns the states at the starts of windows with all that is carried on.
+
+        Args:
+            windows: With ``past`` rows before their starts.
+            theta: Parameters, one array (..., 1) each, instead of the model's own;
+                those of first-order lags come last.
+        """
+        theta, time_constants = self._split(theta)
+        start = windows.past
+        states = self.start(windows)
+        first = start - self.lag
+        pending = windows.inputs[:, first:start].reshape(len(windows), -1)
+        no_lags = not len(self.time_constants)
+        lagged = np.empty((len(windows), 0))
+        memory = lagged
+        rows = slice(self.lag, start)
+        if not no_lags:
+            _, lagged = self.acting_inputs(windows, rows, time_constants)
+        if not self.memory.empty:
+            memory = self._remembered(windows, rows)
+        batch = lagged.shape[:-1]
+        parts = (states, lagged, pending, memory)
+        parts = [np.broadcast_to(part, (*batch, part.shape[-1])) for part in parts]
+        return np.concatenate(parts, axis=-1)
+
+    def _remembered(self, windows: Windows, rows: slice) -> Array:
+        """Returns what is remembered at the starts of windows (W, s)."""
+        features, residuals = self.nominal_residuals(windows, rows)
+        return self.memory.begin(features, residuals)
+
+    def nominal_residuals(self, windows: Windows, rows: slice) -> tuple[Array, Array]:
+        """Computes what a memory sees of measured rows.
+
+        Args:
+            windows: W of them.
+            rows: That are wanted; they begin at ``lag`` or later.
+
+        Returns:
+            The features (W, rows, d), and what the nominal part leaves of the outputs
+            (W, rows, o).
+        """
+        states = windows.states[:, rows]
+        next_states = windows.states[:, rows.start + 1 : rows.stop + 1]
+        inputs, _ = self.acting_inputs(windows, rows)
+        context = windows.context[:, rows]
+        modelled = self.nominal_outputs(states, inputs, context)
+        measured = self.kinematics.outputs(states, next_states, windows.time_step)
+        return self.features(states, inputs, context), measured - modelled
 
     def start(self, windows: Windows) -> Array:
         """Estimates the states (W, n) at the starts of windows."""
@@ -144,8 +356,9 @@ class LogModel:
         Args:
             windows: With ``past`` rows or more before their starts.
             steps: Number of states; by default as many as the windows hold.
-            theta: Parameter vectors (T, P) that are rolled out beside each other,
-                without the correction; the model's own by default.
+            theta: Parameter vectors (T, P) that are rolled out beside each other, with
+                the time constants of first-order lags last, and without the correction;
+                the model's own by default.
 
         Returns:
             The states after the start (W, steps, n), or (T, W, steps, n).
@@ -153,28 +366,50 @@ class LogModel:
         Raises:
             SettingError: The windows have too few rows before their starts.
         """
+        n = self.kinematics.space.dim
+        predicted = self.rollout_carried(windows, steps, theta)[..., 1:, :n]
+        if self.correction is None or theta is not None:
+            return predicted
+        return self.correction(windows, predicted)
+
+    def rollout_carried(
+        self, windows: Windows, steps: int | None = None, theta: Array | None = None
+    ) -> Array:
+        """Predicts as ``rollout``, with the start and all that is carried on.
+
+        Returns:
+            (W, 1 + steps, n + ...), or (T, W, 1 + steps, n + ...).
+        """
         if windows.past < self.past:
             rule = f"must be {self.past} rows or more for this model"
             raise SettingError("past", f"{rule}; got {windows.past}")
         if steps is None:
             steps = windows.ahead
-        start = self.start(windows)
         parameters = None
         if theta is not None:
-            start = np.broadcast_to(start, (len(theta), *start.shape))
             parameters = [values[:, None] for values in np.moveaxis(theta, -1, 0)]
+        carried = self.recall(windows, parameters)
+        count = None if theta is None else len(theta)
+        if self.weights.ndim == 3:
+            count = len(self.weights)
+        if count is not None and carried.ndim == 2:
+            carried = np.broadcast_to(carried, (count, *carried.shape))
         context = windows.context[:, windows.past]
         disturbance = self.disturbance(windows, parameters)
+        nominal_theta, time_constants = self._split(parameters)
 
-        def step(k: int, states: Array) -> Array:
-            inputs = windows.inputs[:, windows.past + k - self.lag]
-            outputs = self.outputs(states, inputs, context, parameters) + disturbance
-            return self.kinematics.step(states, outputs, windows.time_step)
+        def step(k: int, carried: Array) -> Array:
+            return self.step(
+                carried,
+                inputs=windows.inputs[:, windows.past + k],
+                context=context,
+                time_step=windows.time_step,
+                disturbance=disturbance,
+                theta=nominal_theta,
+                time_constants=time_constants,
+            )
 
-        predicted = iterate(step, start, steps)[..., 1:, :]
-        if self.correction is None or theta is not None:
-            return predicted
-        return self.correction(windows, predicted)
+        return iterate(step, carried, steps)
 
     def rollout_errors(
         self, windows: Windows, steps: Sequence[int] | np.ndarray | None = None

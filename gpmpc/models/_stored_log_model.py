@@ -1,9 +1,11 @@
 """Models of logs in files: their layout, and its checks.
 
 The header has ``groups``, ``kinematics``, ``nominal``, ``history``, ``lag``, ``gps``,
-``names``, ``time_step`` and, where the model has one, the steps of its ``correction``;
-the tensors are ``theta``, ``noise/...``, ``correction/...``, ``start_filter/...`` and
-those of the GPs, ``gp0/...``. ``gpmpc.logs`` adds the record of the identification.
+``names``, ``time_step`` and, where the model has them, the steps of its ``correction``,
+its ``memory`` and ``without_nominal``; the tensors are ``theta``, ``noise/...``, those
+of the GPs, ``gp0/...``, and where there are some ``correction/...``,
+``start_filter/...``, ``time_constants`` and ``weights``. ``gpmpc.logs`` adds the record
+of the identification.
 """
 
 import itertools
@@ -29,6 +31,7 @@ from gpmpc.models._grouped import GroupedNominal
 from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
 from gpmpc.models._log_dynamics import TIME_CONSTANTS, LogDynamics, OutputNoise
 from gpmpc.models._log_model import LogModel, OutputGP
+from gpmpc.models._memory import NO_MEMORY, Memory
 from gpmpc.models._older_files import STILL
 from gpmpc.models._parametric import AffineNominal, MultirotorNominal
 from gpmpc.models._state_space import StateGroup, StateSpace
@@ -46,6 +49,7 @@ _KINDS_OF_GROUPS = ("vector", "angle", "quaternion")
 _LONGEST = 10_000  # rows that a model from a file looks back
 _SLOWEST = 1e9  # time step of a model from a file [s]
 _MOST = 2048  # states, inputs or context of a model from a file
+_MOST_DECAYS = 64  # exponential means in a memory
 
 
 class NamedLogModel(NamedTuple):
@@ -77,7 +81,7 @@ def log_model_parts(
     gps = []
     for i, gp in enumerate(model.gps):
         gp_header, gp_tensors = posterior_parts(path, gp.posterior)
-        gps.append([gp.outputs, gp_header])
+        gps.append([gp.outputs, gp_header, gp.sees_memory])
         for key, tensor in gp_tensors.items():
             tensors[f"gp{i}/{key}"] = tensor
     is_rigid_body = isinstance(model.kinematics, RigidBodyKinematics)
@@ -96,6 +100,12 @@ def log_model_parts(
     for name, part in _regressions(model).items():
         for key in _REGRESSION_TENSORS:
             tensors[f"{name}/{key}"] = torch.from_numpy(getattr(part, key))
+    if len(model.time_constants):
+        tensors["time_constants"] = torch.from_numpy(model.time_constants)
+    if model.weights.size:
+        header["memory"] = asdict(model.memory)
+        header["without_nominal"] = model.without_nominal
+        tensors["weights"] = torch.from_numpy(model.weights)
     return header, tensors
 
 
@@ -164,12 +174,15 @@ def log_model_of_parts(
         context=np.zeros((1, len(context_names))),
     )
     feature_count = features.shape[1]
+    memory = _memory(header.get("memory"))
+    regressor_count = memory.regressor_dim(feature_count, len(header["history"]))
     gps = []
-    for i, (outputs, posterior_header) in enumerate(header["gps"]):
+    for i, (outputs, posterior_header, *sees_memory) in enumerate(header["gps"]):
         posterior_tensors = tensors_below(f"gp{i}", tensors)
         posterior = posterior_of_parts(path, posterior_header, posterior_tensors)
-        gps.append(OutputGP(tuple(outputs), posterior))
-        _check_gp(gps[-1], feature_count)
+        gps.append(OutputGP(tuple(outputs), posterior, any(sees_memory)))
+        seen = regressor_count - 1 if gps[-1].sees_memory else feature_count
+        _check_gp(gps[-1], seen)
     model = LogModel(
         kinematics=kinematics,
         nominal=_nominal(header["nominal"], kinematics, input_names, context_names),
@@ -179,6 +192,10 @@ def log_model_of_parts(
         gps=tuple(gps),
         correction=_correction(header, tensors, kinematics, input_names, feature_count),
         start_filter=_start_filter(tensors, kinematics, input_names, feature_count),
+        time_constants=_numbers(tensors, "time_constants", (0,)),
+        memory=memory,
+        weights=_numbers(tensors, "weights", (0, 0)),
+        without_nominal=tuple(header.get("without_nominal", ())),
     )
     noise = OutputNoise(
         outputs=tensors["noise/outputs"].numpy(),
@@ -194,8 +211,35 @@ def log_model_of_parts(
     )
     _check_named(named)
     _check_model(model, feature_count)
+    _check_past(model, len(input_names), regressor_count)
     _check_noise(noise, kinematics)
     return named
+
+
+def _memory(fields: Any) -> Memory:
+    """Makes a memory of its fields in a header; none where there are none."""
+    if fields is None:
+        return NO_MEMORY
+    _check_rows("memory", fields["rows"])
+    decays = [fields[key] for key in ("decays", "output_decays")]
+    if sum(map(len, decays)) > _MOST_DECAYS:
+        raise DataError(f"a memory has more than {_MOST_DECAYS} means")
+    for decay in itertools.chain(*decays):
+        check_number("decays", decay, least=0)
+    memory = Memory(fields["rows"], tuple(decays[0]), tuple(decays[1]))
+    if memory.reach > _LONGEST:
+        raise DataError(f"a memory reaches back {memory.reach} rows")
+    return memory
+
+
+def _numbers(tensors: Mapping[str, Tensor], key: str, empty: tuple[int, ...]) -> Array:
+    """Returns a tensor as an array; an empty one where there is none."""
+    if key not in tensors:
+        return np.empty(empty)
+    array = tensors[key].numpy()
+    if array.dtype != np.float64 or not np.isfinite(array).all():
+        raise DataError(f"{key} must be finite float64 numbers")
+    return array
 
 
 def _space(groups: Any) -> StateSpace:
@@ -386,6 +430,22 @@ def _check_model(model: LogModel, feature_count: int) -> None:
         in_range = all(type(i) is int and 0 <= i < outputs for i in gp.outputs)
         if not in_range or len(set(gp.outputs)) < len(gp.outputs):
             raise DataError(f"a GP must predict outputs; got {gp.outputs!r:.80}")
+
+
+def _check_past(model: LogModel, input_dim: int, regressor_count: int) -> None:
+    """Raises ``DataError`` unless what a model remembers has the model's sizes."""
+    outputs = len(model.kinematics.output_names)
+    if len(model.time_constants):
+        check_shape("time_constants", model.time_constants, (input_dim,))
+        if (model.time_constants < 0).any():
+            raise DataError("time_constants must not be negative")
+    if model.weights.size or not model.memory.empty:
+        check_shape("weights", model.weights, (outputs, regressor_count))
+    known = range(outputs)
+    if not all(type(i) is int and i in known for i in model.without_nominal):
+        raise DataError(f"without_nominal must name outputs; got {known!r:.80}")
+    if regressor_count > _MOST:
+        raise DataError(f"the model remembers more than {_MOST} numbers")
 
 
 def _check_rows(key: str, rows: Any) -> None:

@@ -1,0 +1,155 @@
+"""Fits a form of a model to a log: nominal part, first-order lags, linear term."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from gpmpc._dynamics import Array
+from gpmpc.logs._fitting import PAST, NominalFit, fit_nominal
+from gpmpc.logs._linear_terms import fit_linear_term, regression_data
+from gpmpc.logs._log import Log
+from gpmpc.models._kinematics import RigidBodyKinematics
+from gpmpc.models._log_model import LogModel
+from gpmpc.models._memory import NO_MEMORY
+from gpmpc.models._parametric import AffineNominal
+
+_ROWS_OF_LAGS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)  # time constants that are tried
+_FACTORS_OF_LAGS = (0.0, 0.5, 0.7, 1.4, 2.0)  # by which each is tried to change
+_WINDOWS = 150  # whose rollouts compare them
+_JUDGED = (1, 3, 10, 30, 50)  # steps of these
+
+
+def fit_from(
+    start_from: LogModel,
+    model: LogModel,
+    log: Log,
+    steps: int,
+    same_log: bool = False,
+) -> NominalFit:
+    """Fits a model but for its GPs.
+
+    Args:
+        start_from: The search begins at the parameters that this fitted model has in
+            common with the other.
+        model: The model, whose parameters are not known yet.
+        log: The data.
+        steps: Of the rollouts.
+        same_log: Whether ``start_from`` was fitted to the same log. Then a linear term
+            comes upon its nominal part, where the model has the same.
+    """
+    if model.memory.empty:
+        return _fit_nominal_part(start_from, model, log, steps)
+    if same_log and _has_equal_nominal_part(start_from, model):
+        model = replace(
+            model, theta=start_from.theta, time_constants=start_from.time_constants
+        )
+        fitted = fit_linear_term(model, log, steps)
+        return NominalFit(fitted, standard_errors=np.empty(0))
+    without_memory = replace(
+        model,
+        memory=NO_MEMORY,
+        weights=np.empty((0, 0)),
+        gps=(),
+        history=_disturbed_outputs(model),
+    )
+    fit = _fit_nominal_part(start_from, without_memory, log, steps)
+    fitted = replace(
+        model, theta=fit.model.theta, time_constants=fit.model.time_constants
+    )
+    return replace(fit, model=fit_linear_term(fitted, log, steps))
+
+
+def _has_equal_nominal_part(one: LogModel, other: LogModel) -> bool:
+    """Returns whether two models have the same nominal part and lags, the one fitted."""
+    same = one.nominal == other.nominal and one.lag == other.lag
+    return same and len(one.time_constants) == len(other.time_constants)
+
+
+def _disturbed_outputs(model: LogModel) -> tuple[int, ...]:
+    """Returns the rows over which disturbances are averaged beside the nominal part.
+
+    A memory sees disturbances of forces, which change slowly; parameters are fitted
+    with them, and not biased by them.
+    """
+    outputs = len(model.history)
+    if not isinstance(model.kinematics, RigidBodyKinematics):
+        return (0,) * outputs
+    forces = model.kinematics.output_groups["force"]
+    return tuple(PAST if output in forces else 0 for output in range(outputs))
+
+
+def _fit_nominal_part(
+    start_from: LogModel, model: LogModel, log: Log, steps: int
+) -> NominalFit:
+    """Fits the nominal part and the first-order lags of a model without memory."""
+    nominal = model.nominal
+    if isinstance(nominal, AffineNominal):
+        fitted = _fit_affine(model, log, steps)
+        return NominalFit(fitted, standard_errors=np.empty(0))
+    names = start_from.nominal.parameter_names
+    fitted_values = dict(zip(names, start_from.theta, strict=False))
+    defaults = zip(nominal.parameter_names, nominal.start, strict=True)
+    theta0 = np.array([fitted_values.get(name, value) for name, value in defaults])
+    return fit_nominal(model, theta0, log, steps)
+
+
+def _fit_affine(model: LogModel, log: Log, steps: int) -> LogModel:
+    """Fits an affine nominal part one step ahead, and first-order lags on rollouts."""
+    if not len(model.time_constants):
+        return _fit_affine_part(model, log) if _is_fitted(model) else model
+    m = len(log.input_names)
+    trials = _LagTrials(model, log, steps)
+    candidates = [np.full(m, rows * log.time_step) for rows in _ROWS_OF_LAGS]
+    best = min(candidates, key=trials.cost)
+    for i in range(m):
+        candidates = [best]
+        for factor in _FACTORS_OF_LAGS:
+            candidate = best.copy()
+            candidate[i] *= factor
+            candidates.append(candidate)
+        best = min(candidates, key=trials.cost)
+    return trials.fit(best)
+
+
+def _is_fitted(model: LogModel) -> bool:
+    """Returns whether the affine nominal part has parameters."""
+    assert isinstance(model.nominal, AffineNominal)
+    return model.nominal.fitted
+
+
+class _LagTrials:
+    """Affine models with time constants of first-order lags, and their rollouts."""
+
+    def __init__(self, model: LogModel, log: Log, steps: int):
+        self._model = model
+        self._log = log
+        past = max(model.past, PAST)
+        self._windows = log.windows(steps, past=past, most=_WINDOWS)
+        self._steps = sorted({min(step, steps) for step in _JUDGED})
+
+    def fit(self, time_constants: Array) -> LogModel:
+        """Fits the affine part of the model with time constants (m,)."""
+        model = replace(self._model, time_constants=time_constants)
+        return _fit_affine_part(model, self._log)
+
+    def cost(self, time_constants: Array) -> float:
+        """Computes the mean logarithm of the groups' errors at the judged steps."""
+        fitted = self.fit(time_constants)
+        errors = fitted.rollout_errors(self._windows, self._steps)
+        distances = self._windows.space.distances(errors).mean(axis=0)
+        return float(np.log(np.maximum(distances, 1e-12)).mean())
+
+
+def _fit_affine_part(model: LogModel, log: Log) -> LogModel:
+    """Fits an affine nominal part one step ahead on all rows."""
+    past = max(model.past, PAST) if len(model.time_constants) else model.past
+    windows = log.windows(1, past=past)
+    still = replace(
+        model,
+        nominal=AffineNominal(model.kinematics, fitted=False),
+        history=(0,) * len(model.history),
+    )
+    regressors, outputs = regression_data(still, windows)
+    solution: Any = np.linalg.lstsq(regressors, outputs, rcond=1e-8)[0]
+    return replace(model, theta=solution.T.ravel())

@@ -1,0 +1,217 @@
+"""Fits linear terms of past rows: a ridge regression whose penalty rollouts choose.
+
+One step ahead the smallest penalty looks best, since noisy, smoothed and mistimed rows
+explain each other. Many steps ahead it may be useless. So each group of outputs gets
+the penalty with which the rollouts of rows that were left out are best: two halves of
+the log, each of which is rolled out by what the other one taught.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from gpmpc._dynamics import Array
+from gpmpc.exceptions import DataError
+from gpmpc.logs._log import Log, LogRun
+from gpmpc.models._log_model import LogModel
+from gpmpc.models._windows import Windows
+
+PENALTIES = (1e-9, 1e-5, 1e-3, 1e-2, 0.1, 0.3, 1.0)  # of standardised columns, per row
+_FIRST_PENALTY = 1e-2
+_ROWS = 10_000  # to which a term is fitted
+_WINDOWS = 100  # of a half, whose rollouts choose
+_JUDGED = (1, 10, 50)  # steps of them
+_BLOCKS = 8  # of a log of few runs, half of which are left out
+_FEW_RUNS = 4
+
+
+class Moments(NamedTuple):
+    """Second moments of standardised regressors z and targets y, per row."""
+
+    mean: Array  # of the regressors (r,); the constant has 0
+    deviation: Array  # likewise; the constant has 1
+    zz: Array  # (r, r)
+    zy: Array  # (r, o)
+
+    def weights(self, penalties: Array) -> Array:
+        """Solves the ridge regressions of the outputs.
+
+        Args:
+            penalties: Of each output (o,).
+
+        Returns:
+            Weights of the regressors as they are (o, r).
+        """
+        r, o = self.zy.shape
+        weights = np.empty((o, r))
+        is_penalized = np.r_[np.ones(r - 1), 0.0]
+        for penalty in np.unique(penalties):
+            outputs = penalties == penalty
+            damped = self.zz + np.diag(penalty * is_penalized + 1e-12)
+            weights[outputs] = np.linalg.solve(damped, self.zy[:, outputs]).T
+        weights /= self.deviation
+        weights[:, -1] -= weights[:, :-1] @ self.mean[:-1]
+        return weights
+
+
+def fit_linear_term(model: LogModel, log: Log, steps: int) -> LogModel:
+    """Fits the linear term of a model on what its nominal part leaves.
+
+    Args:
+        model: With its memory, and the parameters of its nominal part.
+        log: The data.
+        steps: Of the rollouts that choose the penalties.
+
+    Raises:
+        DataError: No piece of the log is long enough.
+    """
+    penalties = _choose_penalties(model, log, steps)
+    return replace(model, weights=_moments(model, log).weights(penalties))
+
+
+def _choose_penalties(model: LogModel, log: Log, steps: int) -> Array:
+    """Chooses the penalty of each output (o,) by rollouts: of all, then by group."""
+    o = len(model.history)
+    try:
+        trials = [_Trial.of(model, *halves, steps) for halves in _halves(log)]
+    except DataError:  # too short to be divided
+        return np.full(o, _FIRST_PENALTY)
+    penalties = _best(trials, [np.full(o, penalty) for penalty in PENALTIES])
+    groups = model.kinematics.output_groups.values()
+    if len(groups) == 1:
+        return penalties
+    for outputs in groups:
+        candidates = [penalties]
+        for penalty in PENALTIES:
+            candidate = penalties.copy()
+            candidate[list(outputs)] = penalty
+            candidates.append(candidate)
+        penalties = _best(trials, candidates)
+    return penalties
+
+
+def _best(trials: Sequence["_Trial"], candidates: Sequence[Array]) -> Array:
+    """Returns the penalties (o,) whose rollouts are best on the whole."""
+    costs = np.sum([trial.costs(candidates) for trial in trials], axis=0)
+    return candidates[int(np.argmin(costs))]
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """A fit to one half of a log, judged by rollouts of the other one."""
+
+    model: LogModel
+    moments: Moments  # of the one half
+    windows: Windows  # of the other one
+    steps: tuple[int, ...]
+
+    @classmethod
+    def of(cls, model: LogModel, log: Log, held_out: Log, steps: int) -> "_Trial":
+        """Prepares the trial; raises ``DataError`` where a half is too short."""
+        windows = held_out.windows(steps, past=model.past, most=_WINDOWS)
+        judged = tuple(sorted({min(step, steps) for step in _JUDGED}))
+        return cls(model, _moments(model, log), windows, judged)
+
+    def costs(self, candidates: Sequence[Array]) -> Array:
+        """Computes the mean logarithm of errors, for penalties beside each other (C,).
+
+        The errors are those of the groups at the judged steps.
+        """
+        weights = np.stack([self.moments.weights(one) for one in candidates])
+        model = replace(self.model, weights=weights)
+        errors = model.rollout_errors(self.windows, self.steps)
+        distances = self.windows.space.distances(errors).mean(axis=1)
+        return np.log(np.maximum(distances, 1e-12)).mean(axis=(1, 2))
+
+
+def _moments(model: LogModel, log: Log) -> Moments:
+    """Computes the moments of the regressors and the targets of a linear term."""
+    stride = max(-(-len(log) // _ROWS), 1)
+    rows = [
+        _piece_data(model, _as_window(log, run, a, b), stride)
+        for run in log
+        for a, b in run.pieces
+        if b - a > model.past + 1
+    ]
+    if not rows:
+        raise DataError(f"no piece of the log has more than {model.past + 1} rows")
+    regressors = np.concatenate([one for one, _ in rows])
+    residuals = np.concatenate([other for _, other in rows])
+    mean = regressors.mean(axis=0)
+    deviation = regressors.std(axis=0)
+    # What never changes has no effect that could be known.
+    deviation[deviation < 1e-9 * np.maximum(np.abs(mean), 1e-9)] = np.inf
+    mean[-1] = 0.0
+    deviation[-1] = 1.0
+    z = (regressors - mean) / deviation
+    count = len(z)
+    return Moments(mean, deviation, z.T @ z / count, z.T @ residuals / count)
+
+
+def _as_window(log: Log, run: LogRun, begin: int, end: int) -> Windows:
+    """Returns a piece of a run as one window, whose start is its last row but one."""
+    rows = slice(begin, end)
+    past = end - begin - 2
+    return Windows(
+        space=log.space,
+        time_step=log.time_step,
+        past=past,
+        stride=1,
+        states=run.states[None, rows],
+        inputs=run.inputs[None, rows],
+        context=run.context[None, begin : end - 1],
+        runs=np.zeros(1),
+        times=run.time[None, end - 2],
+    )
+
+
+def _piece_data(model: LogModel, piece: Windows, stride: int) -> tuple[Array, Array]:
+    """Returns the regressors (N, r) and targets (N, o) of every so many rows."""
+    rows = slice(model.lag, piece.past + 1)
+    features, residuals = model.nominal_residuals(piece, rows)
+    reach = model.past - model.lag
+    starts = np.arange(reach, len(features[0]), stride)
+    earlier = starts[:, None] + np.arange(-reach, 0)
+    remembered = model.memory.begin(features[0][earlier], residuals[0][earlier])
+    regressors = model.memory.regressors(features[0][starts], remembered)
+    return regressors, residuals[0][starts]
+
+
+def regression_data(model: LogModel, windows: Windows) -> tuple[Array, Array]:
+    """Returns the regressors (W, r) at the starts of windows, and the targets (W, o).
+
+    The targets are what the nominal part leaves of the outputs one step ahead.
+    """
+    past = windows.past
+    states = windows.states[:, past]
+    context = windows.context[:, past]
+    acting, _ = model.acting_inputs(windows, slice(past, past + 1))
+    inputs = acting[:, 0]
+    m = windows.inputs.shape[-1]
+    remembered = model.parts(model.recall(windows), m).memory
+    features = model.features(states, inputs, context)
+    next_states = windows.states[:, past + 1]
+    measured = model.kinematics.outputs(states, next_states, windows.time_step)
+    residuals = measured - model.nominal_outputs(states, inputs, context)
+    return model.memory.regressors(features, remembered), residuals
+
+
+def _halves(log: Log) -> list[tuple[Log, Log]]:
+    """Splits a log in two halves, each of which is left out once.
+
+    By run where there are enough runs, else by blocks of time that alternate.
+    """
+    runs: Sequence[LogRun] = sorted(log.runs, key=len)
+    if len(runs) < _FEW_RUNS:
+        runs = [block for run in log.runs for block in _blocks(run)]
+    halves = [replace(log, runs=tuple(runs[i::2])) for i in range(2)]
+    return [(halves[0], halves[1]), (halves[1], halves[0])]
+
+
+def _blocks(run: LogRun) -> list[LogRun]:
+    """Cuts a run into blocks of time of equal lengths."""
+    ends = np.linspace(0, len(run), _BLOCKS + 1).astype(int).tolist()
+    return [run.part(a, b, f"block {a}") for a, b in pairwise(ends)]
