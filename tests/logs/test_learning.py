@@ -236,7 +236,7 @@ def test_a_model_is_the_same_after_saving_and_damage_is_named(tmp_path):
     assert learned.model.gps
     save_learned(learned, tmp_path / "model.safetensors")
     loaded = load_learned(tmp_path / "model.safetensors")
-    windows = log.windows(20, 20, 100)
+    windows = log.windows(20, max(learned.model.past, 20), 100)
     expected = learned.model.rollout(windows)
     np.testing.assert_allclose(
         loaded.model.rollout(windows), expected, rtol=0, atol=1e-9
@@ -304,7 +304,7 @@ def test_learning_is_the_same_whatever_marks_a_gap(tmp_path):
             noise.outputs,
             noise.measurement,
         ]
-        windows = log.windows(10, 20, 50)
+        windows = log.windows(10, 60, 50)
         noises.append(
             np.concatenate(
                 [
