@@ -106,6 +106,72 @@ class LogModel:
             return rows
         return max(rows, *LAGS)
 
+    @property
+    def parameters(self) -> list[list[float]]:
+        """All numbers but those of GPs, as ``with_parameters`` takes them."""
+        groups = (self.theta, self.time_constants, self.weights.ravel())
+        return [group.tolist() for group in groups]
+
+    def with_parameters(self, parameters: Sequence[Sequence[float]]) -> "LogModel":
+        """Returns the model with the ``parameters`` of another one of its form."""
+        theta, time_constants, weights = [np.array(p, dtype=float) for p in parameters]
+        rows = len(self.history) if len(weights) else 0
+        return replace(
+            self,
+            theta=theta,
+            time_constants=time_constants,
+            weights=weights.reshape(rows, -1) if rows else np.empty((0, 0)),
+        )
+
+    def nominal_outputs(
+        self, states: Array, inputs: Array, context: Array, theta: Any = None
+    ) -> Array:
+        """Computes the outputs of the nominal part alone (..., o).
+
+        Args:
+            states: (..., n).
+            inputs: (..., m), as they act.
+            context: (..., c).
+            theta: Parameters, one array each, instead of the model's own.
+        """
+        theta = self.theta if theta is None else theta
+        nominal = self.nominal.outputs(theta, states, inputs, context)
+        if self.without_nominal:
+            nominal[..., list(self.without_nominal)] = 0.0
+        return nominal
+
+    def learned_outputs(
+        self, states: Array, inputs: Array, context: Array, memory: Array
+    ) -> Array | float:
+        """Computes what the linear term and the GPs add to the outputs (..., o).
+
+        Args:
+            states: (..., n).
+            inputs: (..., m), as they act.
+            context: (..., c).
+            memory: What is remembered (..., s).
+        """
+        if not self.gps and not self.weights.size:
+            return 0.0
+        features = self.features(states, inputs, context)
+        y = np.zeros((*features.shape[:-1], len(self.history)))
+        regressors = features
+        if self.weights.size or not self.memory.empty:
+            regressors = self.memory.regressors(features, memory)
+        if self.weights.size:
+            y += regressors @ np.swapaxes(self.weights, -1, -2)
+        for gp in self.gps:
+            seen = regressors[..., :-1] if gp.sees_memory else features
+            y[..., list(gp.outputs)] += gp.mean(seen)
+        return y
+
+    def features(self, states: Array, inputs: Array, context: Array) -> Array:
+        """Returns the features (..., d) of states, inputs and context."""
+        batch = states.shape[:-1]
+        inputs = np.broadcast_to(inputs, (*batch, inputs.shape[-1]))
+        context = np.broadcast_to(context, (*batch, context.shape[-1]))
+        return self.kinematics.features(states, inputs, context)
+
     def outputs(
         self,
         states: Array,
