@@ -1,6 +1,11 @@
 """Settings of the documentation's site: ``make docs``."""
 
+import sys
 from importlib.metadata import version as installed
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+from notebook import write_notebook
 
 project = "gpmpc"
 author = "the gpmpc authors"
@@ -55,6 +60,15 @@ def mark_formulas(app, what, name, obj, options, lines):
     lines[:] = marked
 
 
+def add_notebook(app, error):
+    """Writes the tutorial as a notebook beside its page."""
+    if error is None:
+        write_notebook(
+            Path(app.srcdir) / "tutorial.md", Path(app.outdir) / "tutorial.ipynb"
+        )
+
+
 def setup(app):
     """Registers what this site adds to Sphinx."""
+    app.connect("build-finished", add_notebook)
     app.connect("autodoc-process-docstring", mark_formulas, priority=100)

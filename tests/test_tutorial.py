@@ -1,0 +1,55 @@
+"""The tutorial tells what happens, as a page and as a notebook."""
+
+import json
+import runpy
+
+import numpy as np
+import pytest
+
+from tests.pages import BLOCK, ROOT, read
+
+PAGE = "docs/tutorial.md"
+
+
+def notebook():
+    return runpy.run_path(str(ROOT / "docs/notebook.py"))["notebook_of"](read(PAGE))
+
+
+def test_every_block_of_the_page_is_a_cell_of_the_notebook():
+    cells = [
+        cell["source"] for cell in notebook()["cells"] if cell["cell_type"] == "code"
+    ]
+    blocks = [text.strip() for _, text in BLOCK.findall(read(PAGE))]
+    assert len(cells) == len(blocks)
+    assert all(text in cell for text, cell in zip(blocks, cells, strict=True))
+    assert cells[0].startswith("%%writefile crane.py\n")
+    assert cells[-1].startswith("%%bash\ngpmpc run")
+    assert sum(cell.startswith("%%") for cell in cells) == 3
+    assert any("mkdir -p system" in cell for cell in cells)
+
+
+def test_the_notebook_is_one():
+    nbformat = pytest.importorskip("nbformat")
+    nbformat.validate(nbformat.reads(json.dumps(notebook()), as_version=4))
+
+
+@pytest.mark.slow
+def test_the_story_of_the_tutorial_holds(page, tmp_path, capsys):
+    names, (flown, swept, report) = page(PAGE)
+    few = names["swing_ahead"](names["few"])
+    many = names["swing_ahead"](names["gp"])
+    assert few["rmse"] > 5 * many["rmse"]
+    assert few["coverage_0.95"] < 0.8 < 0.9 < many["coverage_0.95"]
+    goal = names["plant"].goal
+    radii = [
+        names[key].stability(goal).spectral_radius for key in ("short", "controller")
+    ]
+    assert radii[1] < 0.95 < radii[0]
+    hits = [line for line in capsys.readouterr().out.splitlines() if "of 20" in line]
+    assert [int(line.split()[0]) > 0 for line in hits] == [True, False]
+    assert names["load"](names["beside"]).max() < 2.1
+    assert np.abs(names["beside"].states[-1] - goal).max() < 0.05
+    assert "80 steps of crane" in flown
+    assert "12 runs: 12 flown" in swept
+    assert "6 cells" in report
+    assert (tmp_path / "sweep/report/report.html").exists()
