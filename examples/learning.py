@@ -16,8 +16,7 @@ import numpy as np
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.gp import Trainer, standardize
 from gpmpc.learning import LearningController
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Replaced, closed_loop
 from gpmpc.systems import translational

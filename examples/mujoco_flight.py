@@ -15,9 +15,7 @@ import pandas
 
 from gpmpc.logs import LogMapping, learn, load_flyable, read_log, save_learned
 from gpmpc.models import LogDynamics, LogModel, MultirotorNominal, RigidBodyKinematics
-from gpmpc.mpc import PredictionSettings
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, Rollout, closed_loop
 from gpmpc.systems import System

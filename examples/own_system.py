@@ -14,8 +14,7 @@ import matplotlib.pyplot as plt
 from gpmpc.calibration import Recording, calibrate
 from gpmpc.datasets import RandomData
 from gpmpc.gp import Trainer, standardize
-from gpmpc.mpc.gp_mpc import GPMPC
-from gpmpc.mpc.problem import Box, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.studies.flight import Experiment, metrics, run_trial
 from gpmpc.systems import System, sin

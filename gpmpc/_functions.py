@@ -30,18 +30,29 @@ _TORCH = {  # where torch calls the same function otherwise
 }
 _RULE = "must be written with torch, which follows its own functions alone"
 _OTHERWISE = "or as a CasADi function"
-_PLAIN = {  # what floats, arrays and CasADi take in the place of a function of math
-    "sin": "gpmpc.systems.sin",
-    "cos": "gpmpc.systems.cos",
-    "exp": "gpmpc.systems.exp",
-    "sqrt": "**0.5",
+_OF_SYSTEMS = (  # functions of ``gpmpc.systems``, called as in math
+    *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh"),
+    *("exp", "log", "sqrt", "abs", "min", "max", "where"),
+)
+_PLAIN = {  # what floats, arrays and CasADi take in the place of another function
+    **{name: f"gpmpc.systems.{name}" for name in _OF_SYSTEMS},
+    **{
+        f"arc{name}": f"gpmpc.systems.a{name}" for name in ("sin", "cos", "tan", "tan2")
+    },
     "pow": "**",
-    "fabs": "abs",
+    "fabs": "gpmpc.systems.abs",
+    "hypot": "gpmpc.systems.sqrt of squares",
+    "copysign": "gpmpc.systems.sign",
+    "pi": "its number",
+    "solve": "the solution written out",
+    "inv": "the inverse written out",
 }
 DYNAMICS_RULE = (
-    "must be written with plain arithmetic and sin, cos, exp of gpmpc.systems, "
-    "for floats, arrays and CasADi"
+    "must be written with plain arithmetic and functions of gpmpc.systems (sin, sqrt, "
+    "where, ...), for floats, arrays and CasADi"
 )
+_UNDECIDED = ("truth value", "Boolean value")  # of what has no single one
+_DECISION = "gpmpc.systems.where, min or max for if, and, or, min, max of what has no number yet"
 
 
 def call(key: str, function: Callable[..., Any], *arguments: Tensor) -> Any:
@@ -80,8 +91,8 @@ def call_dynamics(function: Callable[..., Any], *arguments: Any) -> Any:
     """Calls the dynamics of a system on arrays or CasADi expressions.
 
     Raises:
-        SettingError: They failed where they call math or torch. Any other error of
-            their own is left as it is.
+        SettingError: They failed where they call math or torch, or decide by a
+            condition. Any other error of their own is left as it is.
     """
     try:
         return function(*arguments)
@@ -95,7 +106,15 @@ def call_dynamics(function: Callable[..., Any], *arguments: Any) -> Any:
 
 
 def dynamics_advice(error: BaseException, packages: Sequence[str]) -> str | None:
-    """Returns the rule that dynamics broke if they failed in one of these packages."""
+    """Returns the rule that dynamics broke; None of other faults.
+
+    They failed where they call one of these packages, numpy with what it does not
+    take, or decide by a condition of arrays or symbols.
+    """
+    if any(words in str(error) for words in _UNDECIDED):
+        return f"{DYNAMICS_RULE}: {_DECISION}"
+    if type(error).__module__.partition(".")[0] == "numpy":
+        packages = (*packages, "numpy")
     foreign = _foreign_calls(error, packages)
     if not foreign:
         return None

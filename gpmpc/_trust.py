@@ -23,9 +23,15 @@ from gpmpc.exceptions import DataError, SettingError
 #: and name none of these
 MODEL_CODE = frozenset(
     {
-        "gpmpc.systems:sin",
-        "gpmpc.systems:cos",
-        "gpmpc.systems:exp",
+        *(
+            f"{module}:{function}"
+            for module in ("gpmpc.systems", "gpmpc.systems._elementary")
+            for function in (
+                *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
+                *("exp", "log", "sqrt", "abs"),
+            )
+        ),
+        # as older files name them
         "gpmpc.systems._system:sin",
         "gpmpc.systems._system:cos",
         "gpmpc.systems._system:exp",

@@ -38,21 +38,48 @@ Array = NDArray[np.float64]
     SIN,
     COS,
     TAN,
-) = range(16)
-ATAN = 18
-FABS = 29
-FMIN = 34
-FMAX = 35
-INV = 36
-TANH = 39
-ATAN2 = 43
-CONST = 44
-INPUT = 45
-OUTPUT = 46
-TWO_OPERANDS = (ADD, SUB, MUL, DIV, POW, CONSTPOW, FMIN, FMAX, ATAN2)
-OPERATIONS = frozenset(
-    {*range(16), ATAN, FABS, FMIN, FMAX, INV, TANH, ATAN2, CONST, INPUT, OUTPUT}
+    ASIN,
+    ACOS,
+    ATAN,
+    LT,
+    LE,
+    EQ,
+    NE,
+    NOT,
+    AND,
+    OR,
+    FLOOR,
+    CEIL,
+    FMOD,
+    FABS,
+    SIGN,
+    COPYSIGN,
+    IF_ELSE_ZERO,
+    ERF,
+    FMIN,
+    FMAX,
+    INV,
+    SINH,
+    COSH,
+    TANH,
+    ASINH,
+    ACOSH,
+    ATANH,
+    ATAN2,
+    CONST,
+    INPUT,
+    OUTPUT,
+) = range(47)
+LOG1P = 93
+EXPM1 = 94
+HYPOT = 95
+COMPARISONS = (LT, LE, EQ, NE, AND, OR)
+TWO_OPERANDS = (
+    *(ADD, SUB, MUL, DIV, POW, CONSTPOW, FMOD, COPYSIGN, IF_ELSE_ZERO),
+    *(FMIN, FMAX, ATAN2, HYPOT),
+    *COMPARISONS,
 )
+OPERATIONS = frozenset({*range(47), LOG1P, EXPM1, HYPOT})
 
 
 # rows that ``_operate`` works in, beyond those of the tape's places
@@ -107,6 +134,8 @@ def run_tape(tape, z, work, value, tangents):
                 for c in range(0, 8 * d, 8):
                     tangent = load(tangents.places, j * d + c)
                     store(tangents.value, i * d + c, tangent)
+        elif operation == IF_ELSE_ZERO:
+            _choose(tape, k, work, tangents, d)
         elif operation in (INPUT, CONST):
             store(
                 work,
@@ -130,6 +159,27 @@ def run_tape(tape, z, work, value, tangents):
                         second = load(tangents.places, last * d + c)
                         tangent = tangent + by_second * second
                     store(tangents.places, i * d + c, tangent)
+
+
+@njit_noalloc
+def _choose(tape, k, work, tangents, d):
+    """Runs operation k, which takes its second operand where the first is not zero.
+
+    Elsewhere all is zero: what is not chosen need not be finite, nor have a slope.
+    """
+    target = 8 * tape.code[k, 1]
+    condition = 8 * tape.code[k, 2]
+    choice = 8 * tape.code[k, 3]
+    chosen = 8 * tape.places
+    for lane in range(8):
+        work[chosen + lane] = work[condition + lane]
+    for lane in range(8):
+        is_chosen = work[chosen + lane] != 0.0
+        work[target + lane] = work[choice + lane] if is_chosen else 0.0
+        if tangents is not None:
+            for c in range(lane, 8 * d + lane, 8):
+                tangent = tangents.places[choice * d + c] if is_chosen else 0.0
+                tangents.places[target * d + c] = tangent
 
 
 @compiled
@@ -205,11 +255,6 @@ def _operate_rarely(operation, a, b):
     """Does what ``_operate`` does for all other operations, on two numbers."""
     if operation == INV:
         return _over(1.0, a), _over(-1.0, a * a), 0.0
-    if operation == EXP:
-        value = math.exp(a)
-        return value, value, 0.0
-    if operation == LOG:
-        return math.log(a) if a > 0.0 else np.nan, _over(1.0, a), 0.0
     if operation in (POW, CONSTPOW):
         value = a**b
         by_exponent = math.log(a) * value if operation == POW and a > 0.0 else 0.0
@@ -217,30 +262,126 @@ def _operate_rarely(operation, a, b):
     if operation == SQRT:
         root = math.sqrt(a) if a >= 0.0 else np.nan
         return root, _over(0.5, root), 0.0
+    if operation == ASSIGN:
+        return a, 1.0, 0.0
+    if operation in (EXP, EXPM1, LOG, LOG1P, ERF):
+        return _operate_exponential(operation, a)
+    if operation in (TAN, ASIN, ACOS, ATAN):
+        return _operate_trigonometric(operation, a)
+    if operation in (SINH, COSH, TANH, ASINH, ACOSH, ATANH):
+        return _operate_hyperbolic(operation, a)
+    if operation in (FABS, SIGN, FLOOR, CEIL, NOT):
+        return _operate_piecewise(operation, a)
+    if operation in COMPARISONS:
+        return _compare(operation, a, b), 0.0, 0.0
+    return _operate_on_pair(operation, a, b)
+
+
+@njit_noalloc
+def _operate_exponential(operation, a):
+    """Does what ``_operate_rarely`` does, for exponentials and logarithms."""
+    if operation == EXP:
+        value = math.exp(a)
+        return value, value, 0.0
+    if operation == EXPM1:
+        return math.expm1(a), math.exp(a), 0.0
+    if operation == LOG:
+        return math.log(a) if a > 0.0 else np.nan, _over(1.0, a), 0.0
+    if operation == LOG1P:
+        return math.log1p(a) if a > -1.0 else np.nan, _over(1.0, 1.0 + a), 0.0
+    return math.erf(a), 2.0 / math.sqrt(math.pi) * math.exp(-a * a), 0.0
+
+
+@njit_noalloc
+def _operate_trigonometric(operation, a):
+    """Does what ``_operate_rarely`` does, for the tangent and inverse functions."""
     if operation == TAN:
         value = math.tan(a)
         return value, 1.0 + value * value, 0.0
     if operation == ATAN:
         return math.atan(a), 1.0 / (1.0 + a * a), 0.0
-    if operation == ATAN2:
-        squares = a * a + b * b
-        return math.atan2(a, b), _over(b, squares), _over(-a, squares)
+    if not abs(a) <= 1.0:
+        return np.nan, np.nan, 0.0
+    slope = _over(1.0, math.sqrt(1.0 - a * a))
+    if operation == ASIN:
+        return math.asin(a), slope, 0.0
+    return math.acos(a), -slope, 0.0
+
+
+@njit_noalloc
+def _operate_hyperbolic(operation, a):
+    """Does what ``_operate_rarely`` does, for hyperbolic functions and inverse ones."""
     if operation == TANH:
         value = math.tanh(a)
         return value, 1.0 - value * value, 0.0
+    if operation == SINH:
+        return math.sinh(a), math.cosh(a), 0.0
+    if operation == COSH:
+        return math.cosh(a), math.sinh(a), 0.0
+    if operation == ASINH:
+        return math.asinh(a), 1.0 / math.sqrt(1.0 + a * a), 0.0
+    if operation == ACOSH:
+        value = math.acosh(a) if a >= 1.0 else np.nan
+        return value, _over(1.0, math.sqrt(max(a * a - 1.0, 0.0))), 0.0
+    value = math.atanh(a) if abs(a) < 1.0 else np.nan
+    return value, _over(1.0, 1.0 - a * a), 0.0
+
+
+@njit_noalloc
+def _operate_piecewise(operation, a):
+    """Does what ``_operate_rarely`` does, for functions of steps and kinks."""
+    sign = 0.0
+    if a > 0.0:
+        sign = 1.0
+    if a < 0.0:
+        sign = -1.0
     if operation == FABS:
-        slope = 0.0
-        if a > 0.0:
-            slope = 1.0
-        if a < 0.0:
-            slope = -1.0
-        return abs(a), slope, 0.0
+        return abs(a), sign, 0.0
+    if operation == SIGN:
+        return sign, 0.0, 0.0
+    if operation == FLOOR:
+        return np.floor(a), 0.0, 0.0
+    if operation == CEIL:
+        return np.ceil(a), 0.0, 0.0
+    return 1.0 if a == 0.0 else 0.0, 0.0, 0.0
+
+
+@njit_noalloc
+def _compare(operation, a, b):
+    """Returns one where a comparison of two numbers holds, zero elsewhere."""
+    holds = a != 0.0 or b != 0.0
+    if operation == LT:
+        holds = a < b
+    elif operation == LE:
+        holds = a <= b
+    elif operation == EQ:
+        holds = a == b
+    elif operation == NE:
+        holds = a != b
+    elif operation == AND:
+        holds = a != 0.0 and b != 0.0
+    return 1.0 if holds else 0.0
+
+
+@njit_noalloc
+def _operate_on_pair(operation, a, b):
+    """Does what ``_operate_rarely`` does, for further functions of two numbers."""
+    if operation == ATAN2:
+        squares = a * a + b * b
+        return math.atan2(a, b), _over(b, squares), _over(-a, squares)
+    if operation == HYPOT:
+        root = math.hypot(a, b)
+        return root, _over(a, root), _over(b, root)
     if operation == FMIN:
         by_first = 1.0 if a <= b else 0.0
         return min(a, b), by_first, 1.0 - by_first
     if operation == FMAX:
         by_first = 1.0 if a >= b else 0.0
         return max(a, b), by_first, 1.0 - by_first
-    if operation == ASSIGN:
-        return a, 1.0, 0.0
+    if operation == FMOD:
+        value = np.fmod(a, b) if b != 0.0 else np.nan
+        return value, 1.0, -np.trunc(_over(a, b))
+    if operation == COPYSIGN:
+        value = math.copysign(a, b)
+        return value, 1.0 if value == a else -1.0, 0.0
     return np.nan, np.nan, np.nan  # none of ``OPERATIONS``

@@ -163,6 +163,7 @@ def _made(config: DictConfig) -> Experiment:
         on_failure=config.on_failure,
         learning=learning,
         model=model,
+        kinematics=config.get("kinematics", "learned"),  # as older runs were
     )
 
 

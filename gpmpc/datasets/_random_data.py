@@ -54,7 +54,7 @@ class RandomData:
         check_number("data.amplitude", self.amplitude, above=0)
         check_choice("data.starts", self.starts, ("region", "start"))
         check_choice("data.around", self.around, ("middle", "initial_input"))
-        for value in self.noise or ():
+        for value in () if self.noise is None else self.noise:
             check_number("data.noise", value, least=0)
 
     def check(self, system: System, trajectory: Trajectory | None = None) -> None:

@@ -37,6 +37,7 @@ from gpmpc.models._parametric import MultirotorNominal
 from gpmpc.models._residual import ResidualModel
 from gpmpc.models._roll_out import RollOut
 from gpmpc.models._storage import load_model, save_model
+from gpmpc.models._training import train
 
 __all__ = [
     "Affine",
@@ -59,4 +60,5 @@ __all__ = [
     "linearize_by_autograd",
     "load_model",
     "save_model",
+    "train",
 ]

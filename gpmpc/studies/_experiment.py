@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -10,12 +10,11 @@ import numpy as np
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.datasets import DataSource
-from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.exceptions import SettingError, ShapeError, check_choice, check_number
 from gpmpc.gp import Training, Transitions
-from gpmpc.gp.casadi_ import successor_function
 from gpmpc.learning import EpisodicLearning, OnlineLearning
-from gpmpc.models import CasadiFunction
-from gpmpc.models._residual import train_residual
+from gpmpc.models import train
+from gpmpc.models._training import KINEMATICS, Kinematics
 from gpmpc.mpc._policy import OnFailure, check_policy
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Propagator
@@ -49,8 +48,8 @@ class Experiment:
     #: whose transitions are learned; names, units and references are its own
     system: System
     #: from transitions and a ``seed`` to a ``Training``, such as a ``Trainer``; one
-    #: that learns differences sees the system's angles as sine and cosine, and learns
-    #: what the system's nominal model misses
+    #: that learns differences learns what the system's description leaves open
+    #: (``gpmpc.models.train``)
     train: Callable[..., Training]
     #: from a model, or from a ``plant`` where its first argument is called so, to a
     #: ``Controller``
@@ -81,6 +80,8 @@ class Experiment:
     learning: OnlineLearning | EpisodicLearning | None = None
     #: trained before; None trains one where the controller needs it
     model: DynamicsModel | None = None
+    #: whether states that have rates are integrated from these, or learned too
+    kinematics: Kinematics = "integrated"
 
     def __post_init__(self) -> None:
         self._check_functions()
@@ -124,24 +125,11 @@ class Experiment:
         Where the ``prior_lengthscale`` of a trainer is None, the system's limits say
         what it supposes of columns that never move.
         """
-        system = self.system
-        predicts_difference = getattr(self.train, "predicts", None) == "difference"
-        has_structure = bool(system.angle_indices) or system.nominal is not None
-        learns_residual = predicts_difference and has_structure
-        train: Any = self.train
-        if getattr(train, "prior_lengthscale", 1.0) is None:
-            lengthscales = _prior_lengthscales(system, learns_residual)
-            train = replace(train, prior_lengthscale=lengthscales)
-        if not learns_residual:
-            return train(transitions, seed=seed)
-        nominal = None
-        if system.nominal is not None:
-            nominal = CasadiFunction(successor_function(system.nominal))
-        return train_residual(
-            trainer=train,
-            transitions=transitions,
-            angles=system.angle_indices,
-            nominal=nominal,
+        return train(
+            transitions,
+            system=self.system,
+            trainer=self.train,
+            kinematics=self.kinematics,
             seed=seed,
         )
 
@@ -201,6 +189,7 @@ class Experiment:
         check_number("steps", self.steps, least=1, whole=True)
         check_number("seed", self.seed, least=0, whole=True)
         check_policy(self.on_failure)
+        check_choice("kinematics", self.kinematics, KINEMATICS)
 
     def _check_loop(self) -> None:
         """Raises where plant, loop or learning do not fit the controller."""
@@ -260,29 +249,3 @@ class Experiment:
             np.asarray(start, dtype=float),
             np.asarray(plant.initial_input, dtype=float),
         )
-
-
-def _prior_lengthscales(system: System, sine_and_cosine: bool) -> list[float]:
-    """Returns the lengthscales that a GP supposes of columns that never move.
-
-    One unit, or a tenth of the range of the limits, whichever is less: from one limit
-    to the other predictions forget what they know. More would do harm where limits are
-    wide: on its way back to the prior a mean has a slope that nobody has seen, and a
-    controller follows it.
-
-    Args:
-        system: Whose states and inputs the GP sees.
-        sine_and_cosine: Whether it sees angles as sine and cosine, each of one unit.
-    """
-    unlimited = np.full(len(system.state_names), np.inf)
-    lower, upper = system.region or (-unlimited, unlimited)
-    ranges = np.subtract((*upper, *system.input_upper), (*lower, *system.input_lower))
-    lengthscales = []
-    for i, width in enumerate(ranges.tolist()):
-        if sine_and_cosine and i in system.angle_indices:
-            lengthscales += [1.0, 1.0]
-        elif width > 0:
-            lengthscales.append(min(1.0, width / 10))
-        else:
-            lengthscales.append(1.0)
-    return lengthscales

@@ -1,6 +1,6 @@
 """Flies an experiment: learns a model, makes the controller, closes the loop."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -186,21 +186,35 @@ def _start(plant: System, reference: Reference) -> Any:
     return reference.states[0] if plant.start is None else plant.start
 
 
-def rmse(experiment: Experiment, flown: Flown, states: slice = slice(None)) -> float:
-    """Returns the RMSE of the states of a flight; infinite where it diverged."""
-    total = float(errors_of(experiment, flown, states).total)
+def rmse(
+    experiment: Experiment,
+    flown: Flown,
+    states: slice = slice(None),
+    unit: str | None = None,
+) -> float:
+    """Returns the RMSE of the states of a flight; infinite where it diverged.
+
+    It is that of the tracked states in one unit, by default the first one's.
+    """
+    system = experiment.system
+    places = system.tracked_by_unit[system.unit if unit is None else unit]
+    total = float(errors_of(experiment, flown, places, states).total)
     if flown.diverged is not None or not np.isfinite(total):
         return np.inf
     return total
 
 
-def errors_of(experiment: Experiment, flown: Flown, states: slice = slice(None)) -> Any:
-    """Returns the tracking error of the states of a flight but the first of them."""
-    system = experiment.system
+def errors_of(
+    experiment: Experiment,
+    flown: Flown,
+    places: Sequence[int],
+    states: slice = slice(None),
+) -> Any:
+    """Returns the tracking error of some states of a flight, but of the first row."""
     rollout = flown.rollout
     return tracking_error(
         rollout.states[states],
         rollout.references[states],
-        system.tracked_indices,
-        system.angle_indices,
+        places,
+        experiment.system.angle_indices,
     )

@@ -26,6 +26,8 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     the steps said while it flew (``gpmpc.mpc.FlightJudge``). ``lost`` says since when
     and why a flight does not follow its reference: by ``find_loss``, by its judgement,
     or since it diverged. One that diverged has no RMSE: None.
+    ``rmse`` in total, ``error_at_end`` and ``episodes`` are of the tracked states in
+    ``unit``; ``further_units`` has those of others.
     """
     rollout = flown.rollout
     return {
@@ -33,6 +35,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
         "unit": experiment.system.unit,
         "rmse": _rmse_by_axis(experiment, flown),
         "error_at_end": _error_at_end(experiment, flown),
+        "further_units": _further_units(experiment, flown),
         "judgement": _judgement(flown),
         "lost": _loss(experiment, flown),
         "outlook": asdict(flown.outlook) | {"warnings": [*flown.outlook.warnings]},
@@ -49,21 +52,39 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     }
 
 
+def _further_units(experiment: Experiment, flown: Flown) -> dict[str, Any]:
+    """Returns names, RMSE and error at the end of tracked states of further units."""
+    system = experiment.system
+    further = list(system.tracked_by_unit)[1:]
+    return {
+        unit: {
+            "states": [system.state_names[i] for i in system.tracked_by_unit[unit]],
+            "rmse": _finite_or_none(rmse(experiment, flown, unit=unit)),
+            "error_at_end": _error_at_end(experiment, flown, unit),
+        }
+        for unit in further
+    }
+
+
 def _rmse_by_axis(experiment: Experiment, flown: Flown) -> dict[str, float | None]:
     """Returns the RMSE of every tracked state and in total; None where it diverged."""
     tracked = experiment.system.tracked
     total = rmse(experiment, flown)
     if not np.isfinite(total):
         return dict.fromkeys((*tracked, "total"))
-    by_axis = errors_of(experiment, flown).axes.tolist()
+    by_axis = errors_of(
+        experiment, flown, experiment.system.tracked_indices
+    ).axes.tolist()
     return dict(zip(tracked, by_axis, strict=True)) | {"total": total}
 
 
-def _error_at_end(experiment: Experiment, flown: Flown) -> float | None:
+def _error_at_end(
+    experiment: Experiment, flown: Flown, unit: str | None = None
+) -> float | None:
     """Returns how far the last state is from its reference; None if it diverged."""
     if not np.isfinite(rmse(experiment, flown)):
         return None
-    return rmse(experiment, flown, states=slice(-2, None))
+    return rmse(experiment, flown, states=slice(-2, None), unit=unit)
 
 
 def _failures(rollout: Rollout) -> dict[str, int]:
@@ -124,19 +145,20 @@ def _loss(experiment: Experiment, flown: Flown) -> dict[str, Any] | None:
     system = experiment.system
     rollout = flown.rollout
     losses: list[tuple[int, str]] = []  # step and reason
-    far_away = find_loss(
-        rollout.states,
-        rollout.references,
-        axes=system.tracked_indices,
-        least=system.lost,
-        angles=system.angle_indices,
-    )
-    if far_away is not None:
-        reason = (
-            f"{far_away.distance:.3g} {system.unit} from its reference, "
-            f"more than {far_away.limit:.3g} {system.unit}"
+    for unit, places in system.tracked_by_unit.items():
+        far_away = find_loss(
+            rollout.states,
+            rollout.references,
+            axes=places,
+            least=system.lost_from(unit),
+            angles=system.angle_indices,
         )
-        losses.append((far_away.step, reason))
+        if far_away is not None:
+            reason = (
+                f"{far_away.distance:.3g} {unit} from its reference, "
+                f"more than {far_away.limit:.3g} {unit}"
+            )
+            losses.append((far_away.step, reason))
     judgement = rollout.judgement
     if judgement.level == "lost" and judgement.step is not None:
         losses.append((judgement.step, judgement.reason))

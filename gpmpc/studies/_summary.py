@@ -1,6 +1,6 @@
 """Says the metrics of a run in words, a line each."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gpmpc.studies._document import Table
@@ -22,6 +22,7 @@ def summary(result: Result) -> Table:
         ("judgement", _judgement(result)),
         (f"RMSE [{unit}]", _rmse(result)),
         (f"at the end [{unit}]", _error_at_end(result)),
+        *_further_units(result),
         ("episodes before", _episodes(result)),
     ]
     for name, rate in result["violations"].items():
@@ -98,15 +99,33 @@ def _judgement(result: Result) -> str:
 
 
 def _rmse(result: Result) -> str:
+    """Returns the RMSE of the tracked states in the first unit, and of each."""
     rmse = result["rmse"]
     if rmse["total"] is None:
         return "none: it diverged"
-    axes = ", ".join(
-        f"{axis} {value:.3g}"
-        for axis, value in rmse.items()
-        if axis != "total" and value is not None
+    further: set[str] = set()
+    for unit in result.get("further_units", {}).values():
+        further.update(unit["states"])
+    axes = [axis for axis in rmse if axis != "total" and axis not in further]
+    return f"{rmse['total']:.3g}  ({_by_axis(rmse, axes)})"
+
+
+def _further_units(result: Result) -> list[tuple[str, str]]:
+    """Returns the lines of tracked states in further units."""
+    lines = []
+    for name, unit in result.get("further_units", {}).items():
+        if unit["rmse"] is None:
+            continue
+        axes = _by_axis(result["rmse"], unit["states"])
+        lines.append((f"RMSE [{name}]", f"{unit['rmse']:.3g}  ({axes})"))
+        lines.append((f"at the end [{name}]", f"{unit['error_at_end']:.3g}"))
+    return lines
+
+
+def _by_axis(rmse: Mapping[str, float | None], axes: Sequence[str]) -> str:
+    return ", ".join(
+        f"{axis} {rmse[axis]:.3g}" for axis in axes if rmse[axis] is not None
     )
-    return f"{rmse['total']:.3g}  ({axes})"
 
 
 def _error_at_end(result: Result) -> str:

@@ -17,7 +17,8 @@ import numpy as np
 
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import check_choice, check_number, check_numbers
-from gpmpc.systems._system import GRAVITY, System, cos, sin
+from gpmpc.systems._elementary import cos, sin
+from gpmpc.systems._system import GRAVITY, System
 from gpmpc.trajectories import Trajectory
 
 ATTITUDES = ("paper", "exact")  # how thrust direction becomes attitude

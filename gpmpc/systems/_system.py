@@ -19,6 +19,7 @@ from gpmpc.exceptions import (
     check_numbers,
 )
 from gpmpc.signals import Signals
+from gpmpc.systems._elementary import cos, exp, sin  # noqa: F401 (older files: here)
 from gpmpc.trajectories import Trajectory
 
 Array = np.ndarray
@@ -35,13 +36,14 @@ class System:
     (``state_names``, ``input_names``), and one method of two: ``derivative(x, u)``, the
     n entries of dx/dt, or ``successor(x, u)``, those of the next state. They are
     written once, with plain arithmetic on the entries of x and u, so that floats, NumPy
-    arrays and CasADi expressions all pass through the same formula; ``sin``, ``cos``
-    and ``exp`` are for all of them. A right-hand side is integrated with the input held
+    arrays and CasADi expressions all pass through the same formula; for all of them
+    are ``sin``, ``sqrt``, ``where`` and their like of this package, and numpy's of the
+    same names. A right-hand side is integrated with the input held
     constant, by the Runge-Kutta method of order four on equal substeps.
 
     Raises:
-        SettingError: A number out of range, an unknown name, tracked states of several
-            units, or dynamics without a finite value where the system starts.
+        SettingError: A number out of range, an unknown name, rates of each other, or
+            dynamics without a finite value where the system starts.
         ShapeError: A list has another length than there are states or inputs, or the
             dynamics have.
     """
@@ -70,16 +72,16 @@ class System:
     region: Any = None
     #: states whose errors are taken within half a turn [rad]
     angles: Sequence[str] = ()
-    #: states that a trajectory prescribes and errors are reported of, in one unit; by
-    #: default all in that of the first
+    #: states that a trajectory prescribes and errors are reported of, unit by unit; by
+    #: default all in the unit of the first state
     tracked: Sequence[str] = ()
-    #: for a state, the tracked one that it is the time derivative of, such as
-    #: ``{"vx": "x"}``
+    #: for a state, the one that it is the time derivative of, such as ``{"vx": "x"}``:
+    #: a model integrates that one, and references have both
     rates: Mapping[str, str] = field(default_factory=dict)
     #: a flight is not lost while its tracked states are nearer than this to their
-    #: reference, in their unit; with infinity only one that leaves the finite numbers
-    #: is
-    lost: float = inf
+    #: reference, in the unit of the first of them, or by unit such as ``{"m": 10.0,
+    #: "rad": 1.5}``; with infinity only one that leaves the finite numbers is
+    lost: float | Mapping[str, float] = inf
     #: from a trajectory, a count K and the time step to reference states (K, n), where
     #: a trajectory prescribes something other than tracked states
     references: Callable[[Trajectory, int, float], Array] | None = None
@@ -105,8 +107,7 @@ class System:
         self._set("name", self.name or type(self.dynamics).__name__)
         self._complete_units((*states, *inputs))
         self._complete_tracked(states)
-        if self.lost != inf:
-            check_number("lost", self.lost, above=0)
+        self._check_lost()
         self._complete_vectors(states, inputs)
         if self.nominal is not None and self.nominal.signals != self.signals:
             raise SettingError(
@@ -144,7 +145,7 @@ class System:
         for key, names in (
             ("angles", self.angles),
             ("tracked", self.tracked),
-            ("rates", self.rates),
+            ("rates", [*self.rates, *self.rates.values()]),
             ("pose", self.pose.values()),
         ):
             for name in names:
@@ -152,18 +153,39 @@ class System:
                     raise SettingError(
                         key, f"must name states, {', '.join(states)}; got {name!r}"
                     )
-        for name in self.rates.values():
-            if name not in self.tracked:
+        self._check_rates()
+
+    def _check_rates(self) -> None:
+        """Raises where a state has two rates, or is in the end its own."""
+        for rate, position in self.rates.items():
+            if list(self.rates.values()).count(position) > 1:
                 raise SettingError(
-                    "rates",
-                    f"must be of tracked states, {', '.join(self.tracked)}; "
-                    f"got {name!r}",
+                    "rates", f"must be one a state; got several of {position}"
                 )
-        units = sorted({self.units[name] for name in self.tracked})
-        if len(units) > 1:
-            raise SettingError(
-                "tracked", f"must be states of one unit; got {', '.join(units)}"
-            )
+            integrals = [rate]
+            while integrals[-1] in self.rates:
+                integrals.append(self.rates[integrals[-1]])
+                if integrals[-1] in integrals[:-1]:
+                    chain = " of ".join(integrals)
+                    raise SettingError(
+                        "rates", f"must not go round in circles; got {chain}"
+                    )
+
+    def _check_lost(self) -> None:
+        """Raises unless ``lost`` has positive distances of units that are tracked."""
+        lost = self.lost
+        if not isinstance(lost, Mapping):
+            lost = {self.unit: lost}
+        units = list(self.tracked_by_unit)
+        for unit, distance in lost.items():
+            if unit not in units:
+                raise SettingError(
+                    "lost",
+                    f"must be of units of tracked states, {', '.join(units)}; "
+                    f"got {unit!r}",
+                )
+            if distance != inf:
+                check_number("lost", distance, above=0)
 
     def _complete_vectors(self, states: Sequence[str], inputs: Sequence[str]) -> None:
         """Turns limits, input, goal, start and region into tuples of floats."""
@@ -225,8 +247,23 @@ class System:
 
     @property
     def unit(self) -> str:
-        """The unit of the tracked states."""
+        """The unit of the first tracked state."""
         return self.units[self.tracked[0]]
+
+    @cached_property
+    def tracked_by_unit(self) -> dict[str, list[int]]:
+        """Where the tracked states of each unit stand; ``unit`` is the first one."""
+        by_unit: dict[str, list[int]] = {}
+        for name in self.tracked:
+            places = by_unit.setdefault(self.units[name], [])
+            places.append(self.state_names.index(name))
+        return by_unit
+
+    def lost_from(self, unit: str) -> float:
+        """Returns the distance up to which no flight is lost, in a unit of ``lost``."""
+        if isinstance(self.lost, Mapping):
+            return self.lost.get(unit, inf)
+        return self.lost if unit == self.unit else inf
 
     @cached_property
     def tracked_indices(self) -> list[int]:
@@ -288,8 +325,9 @@ class System:
         if self.rates:
             velocities = trajectory.velocity(times)
             for rate, position in self.rates.items():
-                column = self.state_names.index(rate)
-                states[:, column] = velocities[:, self.tracked.index(position)]
+                if position in self.tracked:
+                    column = self.state_names.index(rate)
+                    states[:, column] = velocities[:, self.tracked.index(position)]
         return states
 
     def _check_length(self, method: str, entries: Any) -> Any:
@@ -394,21 +432,6 @@ def step_many(plant: System, states: Array, inputs: Array) -> Array:
         for entry in entries
     ]
     return np.stack(columns, axis=1)
-
-
-def sin(angle: Any) -> Any:
-    """Sine of a float, an array, or whatever knows its own (CasADi, torch)."""
-    return angle.sin() if hasattr(angle, "sin") else np.sin(angle)
-
-
-def cos(angle: Any) -> Any:
-    """Cosine of a float, an array, or whatever knows its own (CasADi, torch)."""
-    return angle.cos() if hasattr(angle, "cos") else np.cos(angle)
-
-
-def exp(value: Any) -> Any:
-    """Exponential of a float, an array, or whatever knows its own (CasADi, torch)."""
-    return value.exp() if hasattr(value, "exp") else np.exp(value)
 
 
 def check_system(key: str, value: Any) -> None:

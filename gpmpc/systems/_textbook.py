@@ -12,7 +12,8 @@ from typing import Any, Literal
 
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import check_choice, check_number
-from gpmpc.systems._system import GRAVITY, System, cos, exp, sin
+from gpmpc.systems._elementary import cos, exp, sin
+from gpmpc.systems._system import GRAVITY, System
 
 
 class _Body:
@@ -161,7 +162,7 @@ def cart_pole(time_step: float = 0.05, **parameters: float) -> System:
         start=[0.0, 0.0, pi, 0.0],
         region=[[-2.0, -3.0, -2.0, -8.0], [2.0, 3.0, 2 * pi + 2, 8.0]],
         angles=["angle"],
-        rates={"velocity": "position"},
+        rates={"velocity": "position", "rate": "angle"},
         lost=10.0,
     )
 
@@ -341,7 +342,7 @@ def planar_quadrotor(time_step: float = 0.05, **parameters: float) -> System:
         start=[1.0, 0.0, -1.0, 0.0, 0.0, 0.0],
         region=[[-2.0, -2.0, -2.0, -2.0, -0.8, -3.0], [2.0, 2.0, 2.0, 2.0, 0.8, 3.0]],
         angles=["tilt"],
-        rates={"vx": "x", "vy": "y"},
+        rates={"vx": "x", "vy": "y", "tilt_rate": "tilt"},
         pose={"x": "x", "z": "y"},
         lost=10.0,
     )

@@ -176,8 +176,8 @@ def make_environment(system: System | str, **settings: Any) -> Any:
 
     The system may be one of this package's, by name and settings. The observation is
     the state. The reward is minus the squared distance of the tracked states from the
-    goal; an episode ends where they are farther from it than at the start, and than
-    ``System.lost``.
+    goal, those in the unit of the first; an episode ends where they are farther from it
+    than at the start, and than ``System.lost``.
     """
     gymnasium = library("gymnasium")
     flown: System = (
@@ -210,7 +210,7 @@ def make_environment(system: System | str, **settings: Any) -> Any:
                 lower, upper = region
                 start = self.np_random.uniform(lower, upper)
             self.state = np.array(start, dtype=float)
-            self._limit = max(flown.lost, 1.001 * self._distance())
+            self._limit = max(flown.lost_from(flown.unit), 1.001 * self._distance())
             return self.state.copy(), {}
 
         def step(self, action: Array) -> tuple[Array, float, bool, bool, dict]:
@@ -227,7 +227,7 @@ def make_environment(system: System | str, **settings: Any) -> Any:
 
         def _distance(self) -> float:
             errors = state_difference(self.state, flown.goal, flown.angle_indices)
-            return float(np.linalg.norm(errors[flown.tracked_indices]))
+            return float(np.linalg.norm(errors[flown.tracked_by_unit[flown.unit]]))
 
     return Environment()
 

@@ -225,8 +225,7 @@ def mujoco_system(
         )
     if joints:
         dynamics: _Joints | _Sensors = _Joints(path, joints, actuators, substeps)
-        tracked = settings.get("tracked") or ()
-        settings = {"rates": {f"{name}_rate": name for name in tracked}} | settings
+        settings = {"rates": {f"{name}_rate": name for name in joints}} | settings
     else:
         dynamics = _Sensors(
             path, sensors, actuators, substeps=substeps, **(observation or {})

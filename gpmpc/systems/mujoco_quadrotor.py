@@ -13,7 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gpmpc.exceptions import check_number, check_numbers
-from gpmpc.systems._system import GRAVITY, System, cos, sin
+from gpmpc.systems._elementary import cos, sin
+from gpmpc.systems._system import GRAVITY, System
 from gpmpc.systems.mujoco_ import mujoco_system
 
 _MODEL = Path(__file__).with_name("quadrotor.xml")

@@ -21,15 +21,28 @@ EVERY = casadi.vertcat(
     + 1 / (3 + casadi.cos(X[0])),
     casadi.fabs(X[0]) ** 1.5 + (2 + X[1] ** 2) ** X[2] - 2 * U[1],
 )
-
-
+FURTHER = casadi.vertcat(
+    casadi.asin(0.4 * X[0]) + casadi.acos(0.4 * X[1]) + casadi.erf(X[2]),
+    casadi.sinh(X[0]) - casadi.cosh(X[1]) + casadi.asinh(X[2]),
+    casadi.acosh(1.5 + X[0]) + casadi.atanh(0.4 * X[1]) + casadi.log1p(X[2]),
+    casadi.expm1(X[0]) * casadi.hypot(X[1], X[2]) + casadi.copysign(X[0], X[1] - 1),
+    casadi.floor(3 * X[0]) * X[1] + casadi.ceil(2 * X[1]) + casadi.fmod(X[2], 0.7),
+    casadi.sign(X[0] - 1) * X[1],
+    casadi.if_else(X[0] > X[1], X[2] ** 2, casadi.sin(U[0])),
+    casadi.if_else(casadi.logic_and(X[0] <= 1, X[1] != X[2]), X[0], X[1] * U[0]),
+    casadi.if_else(casadi.logic_or(X[0] > 1, X[1] == 3), X[0] * X[2], U[1]),
+)
 MATRIX = casadi.horzcat(
     casadi.vertcat(X[0] * X[1], casadi.sin(X[2])), casadi.vertcat(2.0, X[1] ** 3)
 )
-FUNCTIONS = casadi.Function("f", [X, U], [EVERY]), casadi.Function("f", [X], [MATRIX])
+FUNCTIONS = (
+    casadi.Function("f", [X, U], [EVERY]),
+    casadi.Function("f", [X, U], [FURTHER]),
+    casadi.Function("f", [X], [MATRIX]),
+)
 
 
-@pytest.mark.parametrize("function", FUNCTIONS, ids=["vector", "matrix"])
+@pytest.mark.parametrize("function", FUNCTIONS, ids=["vector", "further", "matrix"])
 def test_a_tape_has_the_values_and_derivatives_of_casadi(function, rng):
     compiled = CasadiFunction(function)
     plain = CasadiFunction(function)
@@ -50,11 +63,19 @@ def test_a_tape_has_the_values_and_derivatives_of_casadi(function, rng):
 def test_matrix_expressions_expand_and_other_calls_have_no_tape():
     x = casadi.MX.sym("x", 2)
     assert tape_of(casadi.Function("f", [x], [casadi.sin(x) @ x.T])) is not None
-    assert tape_of(casadi.Function("f", [X], [casadi.floor(X)])) is None
     table = casadi.interpolant(
         "table", "bspline", [[0.0, 1.0, 2.0, 3.0, 4.0]], [0.0, 1.0, 4.0, 9.0, 16.0]
     )
     assert tape_of(casadi.Function("f", [x], [table(x[0])])) is None
+
+
+def test_what_a_condition_leaves_out_need_not_be_finite():
+    x = casadi.SX.sym("x")
+    root = casadi.if_else(x > 0, casadi.sqrt(x), 2 * x)
+    function = CasadiFunction(casadi.Function("f", [x], [root]))
+    values, slopes = function.linearize(np.array([[-1.0], [4.0]]))
+    assert values.ravel().tolist() == [-2.0, 2.0]
+    assert slopes.ravel().tolist() == [2.0, 0.25]
 
 
 def test_one_call_rolls_a_known_model_out_within_bounds(rng):

@@ -198,42 +198,23 @@ def test_episodes_have_own_seeds_and_the_best_model_flies_last(monkeypatch):
     assert episodes.rollout == "flight 4"
 
 
-def test_a_system_with_a_nominal_or_angles_learns_a_residual(monkeypatch):
-    monkeypatch.setattr(
-        _experiment,
-        "train_residual",
-        lambda **arguments: ("residual", *arguments.values()),
-    )
-    monkeypatch.setattr(
-        _experiment, "successor_function", lambda known: ("after", known)
-    )
-    monkeypatch.setattr(
-        _experiment, "CasadiFunction", lambda function: ("function", function)
-    )
+def test_an_experiment_trains_as_its_system_says(monkeypatch):
+    calls = []
 
-    def train(data, seed):
-        return data, seed
+    def train(transitions, **arguments):
+        calls.append((transitions, arguments))
+        return "training"
 
-    train.predicts = "difference"
-    angles = PENDULUM.angle_indices
-    assert angles
-    plain = experiment(train=train)
-    turning = experiment(train=train, system=PENDULUM, trajectory=None)
-    assert plain.learn("rows", 3) == ("rows", 3)
-    assert turning.learn("rows", 3) == ("residual", train, "rows", angles, None, 3)
-    known = experiment(train=train, system=replace(PLANT, nominal=PLANT))
-    assert known.learn("rows", 3) == (
-        "residual",
-        train,
-        "rows",
-        PLANT.angle_indices,
-        ("function", ("after", PLANT)),
-        3,
-    )
-    train.predicts = "next_state"
-    assert turning.learn("rows", 3) == known.learn("rows", 3) == ("rows", 3)
-    del train.predicts
-    assert turning.learn("rows", 3) == ("rows", 3)
+    monkeypatch.setattr(_experiment, "train", train)
+    flight = experiment(system=PENDULUM, trajectory=None, kinematics="learned")
+    assert flight.learn("rows", 3) == "training"
+    expected = {
+        "system": PENDULUM,
+        "trainer": flight.train,
+        "kinematics": "learned",
+        "seed": 3,
+    }
+    assert calls == [("rows", expected)]
 
 
 class Rows:

@@ -196,14 +196,19 @@ def test_a_trajectory_gives_the_tracked_states_and_their_rates():
             "tracked: must name states, position, speed; got 'velocity'",
         ),
         (
-            {"tracked": ["position", "speed"]},
+            {"lost": {"rad": 1.0}},
             SettingError,
-            "tracked: must be states of one unit; got m, m/s",
+            "lost: must be of units of tracked states, m; got 'rad'",
         ),
         (
-            {"rates": {"position": "speed"}},
+            {"rates": {"speed": "place"}},
             SettingError,
-            "rates: must be of tracked states, position; got 'speed'",
+            "rates: must name states, position, speed; got 'place'",
+        ),
+        (
+            {"rates": {"position": "speed", "speed": "position"}},
+            SettingError,
+            "rates: must not go round in circles; got position of speed of position",
         ),
         ({"angles": ["position "]}, SettingError, "angles: must name states"),
         ({"input_lower": [1.0], "input_upper": [-1.0]}, SettingError, "must not cross"),

@@ -1,0 +1,161 @@
+"""Positions that are integrated from their rates, as the data of a system show them.
+
+Where a state x_i is the integral of another one, x_j, its next value follows from what
+is learned of that one:
+
+    x_i[k+1] - x_i[k] - h x_j[k] = c h (x_j[k+1] - x_j[k]),
+
+or, where there is a nominal model f, x_i[k+1] - f_i = c h (x_j[k+1] - f_j). c is 1/2
+for a rate that moves evenly within the step h, 1 for a simulator that moves a position
+by the new rate (semi-implicit Euler); the data tell, by two-stage least squares, since
+noise of the rates would bias plain least squares. What is then left of a position is
+its noise, as a rule, and is not learned. Where it is mostly a function of state and
+input (a rate of body axes, or a coarse time step), it is.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gpmpc._angles import state_difference
+from gpmpc.models._features import Features
+from gpmpc.models._nominal import Affine
+from gpmpc.models._residual_data import Nominal, nominal_next_state
+
+_LEARNABLE = 0.5  # of the variance of what is left: from this on it is learned
+_EVEN = 0.5  # c of a rate that moves evenly within a step
+_SIGNIFICANT = 3.0  # standard errors from which on c is another one
+_ROWS_PER_TERM = 3  # of the regressions
+
+
+@dataclass(frozen=True)
+class KinematicResidual:
+    """What of a model is known by its rates, and what is left to learn."""
+
+    nominal: Nominal  #: f, with positions moved by their rates
+    B: Tensor  #: effect (n, k) of the k outputs that are learned
+    noise: Tensor  #: variance (n,) of what is not learned: of integrated positions
+
+
+def kinematic_residual(
+    rates: Mapping[int, int],
+    features: Features,
+    nominal: Nominal | None,
+    states: Tensor,
+    inputs: Tensor,
+    next_states: Tensor,
+    time_step: float,
+) -> KinematicResidual:
+    """Finds how positions follow from their rates.
+
+    Args:
+        rates: The position of each rate, by index; each position has one rate.
+        features: What the model sees.
+        nominal: A known model; None for x[k] moved by its rates.
+        states: x[k] (N, n).
+        inputs: u[k] (N, m).
+        next_states: x[k+1] (N, n).
+        time_step: h [s].
+    """
+    n = states.shape[1]
+    A = torch.eye(n, dtype=states.dtype)
+    predicted = states
+    if nominal is not None:
+        predicted = nominal_next_state(nominal, states, inputs, features.angles)
+    change = state_difference(next_states, predicted, features.angles)
+    basis = _basis(torch.cat(features(states, inputs), dim=1))
+    effect = torch.eye(n, dtype=states.dtype)
+    noise = torch.zeros(n, dtype=states.dtype)
+    learned = list(range(n))
+    for rate, position in _from_the_highest(rates):
+        moved = change[:, position]
+        if nominal is None:
+            moved = moved - time_step * states[:, rate]
+        by_rate = time_step * change[:, rate]
+        share = _share(moved, by_rate, basis)
+        rest = moved - share * by_rate
+        A[position] += time_step * A[rate] * share
+        A[position, rate] += time_step * (1 - share)
+        moved_by_outputs = share * time_step * effect[rate]
+        if _learnable_part(rest, basis) > _LEARNABLE:
+            effect[position] += moved_by_outputs
+            continue
+        effect[position] = moved_by_outputs
+        noise[position] = rest.square().mean()
+        learned.remove(position)
+    if nominal is None:
+        known = Affine.identity(n, inputs.shape[1])
+        nominal = Affine(A=A, B=known.B, c=known.c)
+    return KinematicResidual(nominal, effect[:, learned], noise)
+
+
+def _from_the_highest(rates: Mapping[int, int]) -> list[tuple[int, int]]:
+    """Returns pairs (rate, position), those of accelerations before velocities."""
+
+    def derivatives_above(position: int) -> int:
+        above = [rate for rate, moved in rates.items() if moved == position]
+        return 1 + derivatives_above(above[0]) if above else 0
+
+    return sorted(rates.items(), key=lambda pair: derivatives_above(pair[1]))
+
+
+def _basis(features: Tensor) -> Tensor:
+    """Returns an orthonormal basis (N, t) of polynomials of features (N, d).
+
+    They have products where there are rows enough, else squares, else neither.
+    """
+    size, d = features.shape
+    spread = features.std(dim=0, correction=0)
+    scaled = (features - features.mean(dim=0)) / spread.clamp(min=1e-12)
+    one = torch.ones(size, 1, dtype=features.dtype)
+    columns = [one, scaled, scaled.square()]
+    if 1 + d + d * (d + 1) // 2 <= size // _ROWS_PER_TERM:
+        i, j = torch.triu_indices(d, d, offset=1)
+        columns.append(scaled[:, i] * scaled[:, j])
+    elif 1 + 2 * d > size // _ROWS_PER_TERM:
+        columns.pop()
+    polynomials = torch.cat(columns, dim=1)
+    U, sizes, _ = torch.linalg.svd(polynomials, full_matrices=False)
+    return U[:, sizes > 1e-9 * sizes[0]]
+
+
+def _share(moved: Tensor, by_rate: Tensor, basis: Tensor) -> float:
+    """Estimates c of ``moved`` = c ``by_rate``, both (N,), in [0, 1].
+
+    It is 1/2 unless the data contradict.
+    """
+    explained = basis @ (basis.mT @ by_rate)
+    energy = float(explained @ by_rate)
+    if energy <= 0.0:
+        return _EVEN
+    share = float(explained @ moved) / energy
+    rest = moved - share * by_rate
+    error = (float(rest.square().mean()) / energy) ** 0.5
+    if abs(share - _EVEN) <= _SIGNIFICANT * error:
+        return _EVEN
+    return min(max(share, 0.0), 1.0)
+
+
+def _learnable_part(rest: Tensor, basis: Tensor) -> float:
+    """Returns which part of the mean square of ``rest`` (N,) the features explain.
+
+    It is corrected for the number of terms, which explain some of any noise.
+    """
+    size, terms = basis.shape
+    whole = float(rest.square().sum())
+    if terms >= size or whole == 0.0:
+        return 0.0
+    unexplained = float((rest - basis @ (basis.mT @ rest)).square().sum())
+    return 1.0 - unexplained / (size - terms) / (whole / size)
+
+
+def positions_by_rate(
+    rates: Mapping[str, str], state_names: Sequence[str]
+) -> dict[int, int]:
+    """Returns the index of the position of each rate, by the rate's index."""
+    return {
+        state_names.index(rate): state_names.index(position)
+        for rate, position in rates.items()
+    }
