@@ -202,7 +202,7 @@ class OfTorch(OfMath):
 
 
 def test_dynamics_get_the_name_to_use():
-    advice = r"\*\*0.5 for math.sqrt, gpmpc.systems.cos for math.cos"
+    advice = r"gpmpc.systems.sqrt for math.sqrt, gpmpc.systems.cos for math.cos"
     with pytest.raises(SettingError, match=f"dynamics: .*{advice}"):
         step_many(System(OfMath(), 0.1), np.zeros((3, 2)), np.zeros((3, 1)))
     with pytest.raises(SettingError, match=r"dynamics: .*systems.exp for torch.exp"):

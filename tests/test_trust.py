@@ -162,6 +162,7 @@ FILES_THAT_ARE_READ = {"folder", "path"}
 GUARDED = {"trusted", "environment", "make", "options"}
 NAMES = {
     "units",
+    "lost",
     "angles",
     "tracked",
     "rates",

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import (
+    SettingError,
     TrainingError,
     UnsupportedModel,
     check_choice,
@@ -368,7 +369,12 @@ class Trainer:
 
 @explains_arguments
 def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:
-    """Fits one GP per output: ``Trainer(**settings)(transitions, seed)``."""
+    """Fits one GP per output: ``Trainer(**settings)(transitions, seed)``.
+
+    ``gpmpc.models.train`` takes a system as well, and learns what that leaves open.
+    """
+    if "system" in settings:
+        raise SettingError("system", "is an argument of train of gpmpc.models")
     return Trainer(**settings)(transitions, seed)
 
 

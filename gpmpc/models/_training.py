@@ -12,6 +12,7 @@ from typing import Any, Literal, cast
 import numpy as np
 import torch
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, ShapeError, check_choice
 from gpmpc.gp import Trainer, Training, Transitions, standardize
 from gpmpc.gp._transitions import check_transitions
@@ -29,6 +30,7 @@ Kinematics = Literal["integrated", "learned"]
 KINEMATICS = ("integrated", "learned")
 
 
+@explains_arguments
 def train(
     transitions: Transitions,
     system: System | None = None,
@@ -80,31 +82,14 @@ def train(
             ", ".join(settings), "are settings of a Trainer: give them to `trainer`"
         )
     if system is None:
-        trainer = trainer or _trainer(settings)
+        trainer = trainer or Trainer(**settings)
         return trainer(transitions, seed=seed)
     _check_system(system)
     transitions = _named(transitions, system)
     if trainer is None:
-        trainer = _trainer(
-            {"predicts": "difference", "scaling": standardize} | settings
-        )
+        defaults = {"predicts": "difference", "scaling": standardize}
+        trainer = Trainer(**(defaults | settings))
     return _train_on_system(transitions, system, trainer, kinematics, seed)
-
-
-def _trainer(settings: dict[str, Any]) -> Trainer:
-    """Makes a trainer.
-
-    Raises:
-        SettingError: A setting is unknown.
-    """
-    unknown = sorted(settings.keys() - Trainer.__dataclass_fields__.keys())
-    if unknown:
-        known = ", ".join(Trainer.__dataclass_fields__)
-        raise SettingError(
-            ", ".join(unknown),
-            f"must be a setting of train or of Trainer: {known}",
-        )
-    return Trainer(**settings)
 
 
 def _check_system(system: Any) -> None:

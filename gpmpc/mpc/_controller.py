@@ -366,8 +366,8 @@ class Request(NamedTuple):
             guess = one_step_on(_as_array(last_decision.inputs))
         else:
             guess = np.tile(last_input, (horizon, 1))
-        if problem.cost.angles and states is None and finite:
-            targets = _unwrap(targets, state, last_decision, problem.cost.angles)
+        if problem.cost.angle_indices and states is None and finite:
+            targets = _unwrap(targets, state, last_decision, problem.cost.angle_indices)
         lower, upper = problem.inputs.sides
         return cls(
             state=state,

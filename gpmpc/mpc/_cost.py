@@ -52,8 +52,8 @@ class Tracking:
     #: ``"increments"``
     penalized: Penalized = "increments"
     #: indices of states whose error is modulo 2 pi: their references move by full turns
-    #: towards the plan; None for none
-    angles: Sequence[int] = ()
+    #: towards the plan. None: those that the controller's model knows as angles
+    angles: Sequence[int] | None = None
 
     def __post_init__(self) -> None:
         Q = _weight("Q", self.Q)
@@ -70,11 +70,17 @@ class Tracking:
             rule = f"must be a weight of {n} states"
             raise SettingError("terminal", f"{rule}; got {len(terminal)}")
         check_choice("penalized", self.penalized, PENALIZED)
-        angles = _read_indices("angles", self.angles, n)
+        if self.angles is not None:
+            angles = _read_indices("angles", self.angles, n)
+            object.__setattr__(self, "angles", angles)
         object.__setattr__(self, "Q", Q)
         object.__setattr__(self, "R", R)
         object.__setattr__(self, "terminal", terminal)
-        object.__setattr__(self, "angles", angles)
+
+    @property
+    def angle_indices(self) -> tuple[int, ...]:
+        """The ``angles``; none where they are left to a controller's model."""
+        return tuple(self.angles or ())
 
     def by_stage(self, horizon: int) -> tuple[Array, Array]:
         """Returns the weights of all stages.
@@ -333,13 +339,11 @@ def _count_arguments(function: Any) -> tuple[int, int]:
 
 
 def _read_indices(key: str, indices: Any, n: int) -> tuple[int, ...]:
-    """Returns indices of n states, none for None.
+    """Returns indices of n states.
 
     Raises:
         SettingError: They are no list of whole numbers from 0 to n - 1.
     """
-    if indices is None:
-        return ()
     is_list = isinstance(indices, Iterable) and not isinstance(indices, str)
     read: tuple[Any, ...] = tuple(indices) if is_list else ()
     are_whole = all(isinstance(one, int | np.integer) for one in read)

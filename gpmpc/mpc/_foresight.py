@@ -325,7 +325,7 @@ class Foresight:
         targets = np.asarray(whole.reference.states)
         state = flight.states[0]
         last = no_plan(question.previous_input, len(state), length)
-        angles = controller.problem.cost.angles
+        angles = controller.problem.cost.angle_indices
         for _ in range(rounds):
             turns = full_turns(flight.states - targets, angles)
             plan = controller.control(

@@ -115,7 +115,7 @@ class FlightJudge:
         m = problem.input_dim
         lower, upper = problem.inputs.first
         angles = np.zeros(n)
-        angles[list(problem.cost.angles)] = 1.0
+        angles[list(problem.cost.angle_indices)] = 1.0
         model_noise = np.zeros(n)
         if noise is not None:
             model_noise = np.asarray(noise, dtype=float)

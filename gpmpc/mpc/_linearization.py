@@ -190,6 +190,7 @@ class PredictionModel:
             rule = "must be PredictionSettings(...)"
             raise SettingError("prediction", f"{rule}; got {type(settings).__name__}")
         self.propagator = propagator
+        problem = problem.with_angles(angles_of(model))
         self.problem = problem
         self.state_dim = problem.state_dim
         self.input_dim = problem.input_dim
@@ -227,7 +228,7 @@ class PredictionModel:
         )
         self.roll_out_means = RollOut(model)
         #: what cost or model take for angles: a sensor may show them within a turn
-        self.angles = sorted({*self.problem.cost.angles, *angles_of(model)})
+        self.angles = sorted({*self.problem.cost.angle_indices, *angles_of(model)})
         self.signals = signals_of(model)
 
     def plan_of(self, means: Array, inputs: Array, covariances: Array) -> Plan:

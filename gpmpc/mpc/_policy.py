@@ -306,7 +306,7 @@ class ControlLoop:
     def _short_way(self, error: np.ndarray) -> np.ndarray:
         """Returns an error (n,) without full turns of the cost's angles."""
         cost = getattr(getattr(self.controller, "problem", None), "cost", None)
-        angles = () if cost is None else cost.angles
+        angles = getattr(cost, "angles", None) or ()
         return error - full_turns(error, angles)
 
     @explains_arguments

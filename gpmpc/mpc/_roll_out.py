@@ -89,7 +89,7 @@ def cost_of_inputs(
     plan = prediction.plan_of(states, inputs, np.zeros((len(states), n, n)))
     references = request.references
     targets = references.states
-    turns = full_turns(states[1:] - targets, prediction.problem.cost.angles)
+    turns = full_turns(states[1:] - targets, prediction.problem.cost.angle_indices)
     cost = prediction.costs.at(plan, request.parameters)
     stage_costs = evaluate_stages.unchecked(
         cost, plan.states, inputs, references._replace(states=targets + turns), 1.0

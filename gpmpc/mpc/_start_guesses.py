@@ -42,7 +42,7 @@ class Starts:
         turns: int | Sequence[int],
     ):
         self._planner = planner
-        self._angles = list(planner.problem.cost.angles)
+        self._angles = list(planner.problem.cost.angle_indices)
         H = planner.horizon
         m = planner.problem.input_dim
         shapes = [np.shape(guess) for guess in guesses if guess is not None]

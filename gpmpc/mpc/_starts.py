@@ -320,7 +320,9 @@ class ManyStarts:
         if not np.isfinite(state).all():
             return self.controller.control(belief, reference, previous, parameters)
         if previous is not None and self._can_continue(previous):
-            turns = full_turns(state - previous.means[1], self.problem.cost.angles)
+            turns = full_turns(
+                state - previous.means[1], self.problem.cost.angle_indices
+            )
             belief = replace(belief, mean=belief.mean - torch.as_tensor(turns))
         situation = _Situation(belief, reference, previous, parameters)
         if self._judges_flights and _is_set_point(reference):
@@ -603,7 +605,7 @@ class ManyStarts:
 
     def _nearest_turn(self, reference: Reference, end: Array) -> Reference:
         """Returns the turn of a reference whose end is nearest to a state (n,)."""
-        turns = full_turns(end - reference.states[-1], self.problem.cost.angles)
+        turns = full_turns(end - reference.states[-1], self.problem.cost.angle_indices)
         return turned(reference, turns)
 
     def _plan_gains(

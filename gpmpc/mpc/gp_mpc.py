@@ -166,7 +166,7 @@ class GPMPC:
         if budget is not None:
             check_number("budget", budget, above=0, unit="[s]")
         self.initial_input = self.prediction.initial_input
-        self.problem = problem
+        self.problem = self.prediction.problem
         self.horizon = horizon
         self.iterations = iterations
         self.tolerance = tolerance

@@ -21,7 +21,7 @@ way: its price falls to what cannot outweigh the cost (``gpmpc.mpc._elastic``).
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from statistics import NormalDist
 from typing import Any, Literal, NamedTuple
@@ -309,6 +309,12 @@ class Problem:
         object.__setattr__(self, "constraints", constraints)
         outputs = self._read_parts("outputs", LeastSquares, "LeastSquares(...)")
         object.__setattr__(self, "outputs", outputs)
+
+    def with_angles(self, angles: Sequence[int]) -> "Problem":
+        """Returns the problem with a model's angles, where its cost names none."""
+        if self.cost.angles is not None:
+            return self
+        return replace(self, cost=replace(self.cost, angles=tuple(angles)))
 
     def _read_box(self, key: str) -> Box:
         """Returns bounds of inputs or increments, infinite where there are none."""

@@ -162,7 +162,7 @@ def test_a_sparse_trainer_serves_as_well():
 def test_what_does_not_belong_together_is_refused():
     data = rows(double_integrator(), size=20)
     plant = double_integrator()
-    with pytest.raises(SettingError, match="restart: must be a setting of train"):
+    with pytest.raises(SettingError, match="restart: is no argument .*restarts"):
         train(data, system=plant, restart=2)
     with pytest.raises(SettingError, match="restarts: are settings of a Trainer"):
         train(data, system=plant, trainer=Trainer(), restarts=2)

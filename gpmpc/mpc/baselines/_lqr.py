@@ -9,6 +9,7 @@ from time import perf_counter
 
 import numpy as np
 
+from gpmpc._angles import angles_of
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, check_next_states
 from gpmpc.exceptions import SettingError
@@ -74,6 +75,7 @@ class LQR:
                 "LQR knows the bounds of inputs only; leave those of states out",
             )
         self.model = model
+        problem = problem.with_angles(angles_of(model))
         self.problem = problem
         self.horizon = horizon
         self._linearize = StageLinearizer(model, Linearization(), "none")

@@ -87,6 +87,7 @@ class NMPC:
         )
         check_number("tolerance", tolerance, above=0)
         self.plant = plant
+        problem = problem.with_angles(getattr(plant, "angle_indices", ()))
         self.problem = problem
         self.horizon = horizon
         self._program = _build(plant, problem, horizon, tolerance)

@@ -94,7 +94,7 @@ class StateFormMPC:
             model, propagator, problem, horizon, initial_input, prediction
         )
         self.initial_input = self.prediction.initial_input
-        self.problem = problem
+        problem = self.problem = self.prediction.problem
         self.horizon = horizon
         self.solver = solver
         self.options = TIGHT.get(solver, {}) if options is None else options
