@@ -136,7 +136,7 @@ def cost_of(course: Course, log: Log) -> float:
     """What a flight cost."""
     cost = course.problem.cost
     errors = np.array(log.states) - course.references[1 : course.steps + 1]
-    angles = list(cost.angles)
+    angles = list(cost.angle_indices)
     errors[:, angles] = wrap(errors[:, angles])
     inputs = np.array(log.inputs)
     if cost.penalized == "increments":

@@ -229,7 +229,7 @@ def fly(name: str, horizon: int, weighting: str, kind: str) -> dict[str, Any]:
         state = step(system, state, input)
         states.append(state)
         error = state - system.goal
-        error[list(cost.angles)] = wrap(error[list(cost.angles)])
+        error[list(cost.angle_indices)] = wrap(error[list(cost.angles)])
         paid += float(error @ cost.Q @ error + input @ cost.R @ input)
     upright = [i for i in system.angle_indices if system.state_names[i] != "arm"]
     errors = np.abs(wrap(np.array(states)[:, upright] - np.array(system.goal)[upright]))

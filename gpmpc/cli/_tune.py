@@ -236,5 +236,5 @@ def _cost(job: Job, controller: Mapping[str, Any]) -> float:
         run.references,
         run.inputs[:-1],
         controller["initial_input"],
-        cost.angles or (),
+        cost.angle_indices,
     )

@@ -73,7 +73,7 @@ def definitions(
     tolerance = float(getattr(solver, "tolerance", 1e-9))
     if numbers.precision == "float":
         tolerance = max(tolerance, _FLOAT_TOLERANCE)
-    angles = list(controller.problem.cost.angles)
+    angles = list(controller.problem.cost.angle_indices)
     flags = {
         "GPMPC_IS_FLOAT": numbers.precision == "float",
         "GPMPC_HAS_RATES": controller.problem.input_rates.finite,
@@ -153,7 +153,7 @@ def tables(controller: GPMPC, numbers: Numbers) -> str:
         table("row_lower", lower, "bounds of the rows (H, r)"),
         table("row_upper", upper),
         table("row_prices", _prices(controller, numbers), "of violations (r,)"),
-        integers("cost_angles", problem.cost.angles, "errors modulo 2 pi"),
+        integers("cost_angles", problem.cost.angle_indices, "errors modulo 2 pi"),
         integers("state_angles", prediction.angles, "angles of the cost or the model"),
     ]
     if constraints.gives_way:

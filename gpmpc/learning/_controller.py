@@ -43,7 +43,7 @@ class LearningController:
         self._model = ChangedModel(
             controller.prediction.model,
             self.learning,
-            further_angles=self.problem.cost.angles,
+            further_angles=self.problem.cost.angle_indices,
         )
 
     def control(

@@ -122,7 +122,7 @@ class Tracking:
         """
         Q = self.Q.reshape(-1, *self.Q.shape[-2:])[0]
         R = self.R.reshape(-1, *self.R.shape[-2:])[0]
-        error = state_difference(states[1:], references[1:], self.angles)
+        error = state_difference(states[1:], references[1:], self.angle_indices)
         weighed = inputs
         if self.penalized == "increments":
             weighed = np.diff(inputs, axis=0, prepend=np.atleast_2d(previous_input))

@@ -171,16 +171,17 @@ class Experiment:
 
     def _check_functions(self) -> None:
         """Raises unless training and controller are made when the data are there."""
-        if not callable(self.train):
-            raise SettingError(
-                "train", f"must be a function, such as Trainer(); got {self.train!r}"
-            )
         if not callable(self.controller):
             raise SettingError(
                 "controller",
                 "must be a function from a model to a controller, such as "
                 "functools.partial(GPMPC, propagator=..., problem=..., ...); "
                 f"got {type(self.controller).__name__}",
+            )
+        trains = self.learns and self.model is None
+        if not callable(self.train) and (trains or self.train is not None):
+            raise SettingError(
+                "train", f"must be a function, such as Trainer(); got {self.train!r}"
             )
 
     def _check_numbers(self) -> None:

@@ -249,6 +249,7 @@ def test_the_metrics_of_a_flight_are_written_out_in_full():
         "unit": "m",
         "rmse": pytest.approx({"x": 1.5, "y": 3.0, "z": 2.0, "total": np.sqrt(61 / 4)}),
         "error_at_end": pytest.approx(6.0),
+        "further_units": {},
         "judgement": {
             "level": "suspicious",
             "reason": "odd",

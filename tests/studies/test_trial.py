@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gpmpc.exceptions import Diverged, SettingError, ShapeError
-from gpmpc.gp import Transitions
+from gpmpc.gp import Trainer, Transitions
 from gpmpc.learning import EpisodicLearning, OnlineLearning
 from gpmpc.mpc import PredictionSettings, Problem, Tracking
 from gpmpc.simulation import ModelLoop, Noise
@@ -37,7 +37,7 @@ def experiment(**changes):
         "data": None,
         "trajectory": Elliptical(),
         "system": PLANT,
-        "train": None,
+        "train": Trainer(),
         "controller": steering,
     }
     return Experiment(**settings | {"steps": 5, "model": MODEL} | changes)
