@@ -10,7 +10,7 @@ SMOKE := tests/test_imports.py tests/test_compiled.py tests/test_animation.py te
 	tests/mpc/test_nmpc.py tests/systems tests/recording tests/logs tests/studies tests/cli/test_run.py \
 	tests/cli/test_sweeps.py tests/cli/test_tune.py
 
-.PHONY: tables figures test floors lint bench guard docs live clean
+.PHONY: tables figures test floors lint bench guard cluster docs live clean
 
 tables: $(ENV)  ## The paper's Tables 1 and 2 beside ours; settings: make tables SET="draws=50 data=paper data.folder=DIR"
 	.venv/bin/gpmpc tables $(SET)
@@ -42,6 +42,10 @@ bench: $(ENV)  ## What everything costs on this machine, beside others; some of 
 
 guard: $(ENV)  ## Whether anything became slower since the last commit, both timed in turns
 	.venv/bin/python -m benchmarks.guard
+
+cluster: $(ENV)  ## Sweeps on a real Slurm and a real Ray of two nodes, for half an hour; root; options: make cluster ARGS="--on ray"
+	.venv/bin/python -m pip install --quiet --constraint constraints.txt "ray>=2.40"
+	.venv/bin/python -m benchmarks.cluster $(ARGS)
 
 docs: $(ENV)  ## The documentation as a site in docs/_build; a warning is an error
 	.venv/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"

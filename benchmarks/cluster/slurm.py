@@ -9,16 +9,24 @@ import getpass
 import os
 import secrets
 import shutil
-import signal
 import socket
 import subprocess
-import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+from benchmarks.cluster.processes import (
+    answers,
+    descendants,
+    free_ports,
+    kill,
+    processes_with,
+    wait_for,
+)
 
 NODES = ("n1", "n2")
 NEEDED = ("slurmctld", "slurmd", "munged", "sbatch", "squeue", "scontrol")
 FOR_ACCOUNTING = ("slurmdbd", "mariadbd", "mariadb-install-db", "sacct")
+_NODE_MARK = "GPMPC_NODE"  # variable of the daemons of a node, and of what they start
 _PATIENCE = 60.0  # until a daemon answers [s]
 _PATH = os.pathsep.join([os.environ["PATH"], "/usr/sbin", "/sbin"])
 
@@ -131,11 +139,25 @@ class Slurm:
 
     def kill_node(self, name: str) -> None:
         """Kills a node as a power cut would: its daemon, and all that it started."""
-        _kill_tree(self._daemons.pop(name).pid, among=self._processes_of(name))
+        daemon = self._daemons.pop(name)
+        here = {*processes_with(f"SLURM_CONF={self.folder}/slurm.conf")}
+        steps = here & {*processes_with(f"{_NODE_MARK}={name}")}
+        tasks = here & {*processes_with(f"SLURMD_NODENAME={name}")}
+        # From the top, so that none can tell what happened to those below it.
+        kill([daemon.pid, *descendants(daemon.pid), *steps, *tasks])
+        daemon.wait()
 
-    def start_node(self, name: str) -> None:
-        """Starts the daemon of a node."""
-        self._start(name, ["slurmd", "-D", "-N", name])
+    def start_node(self, name: str, blind_to: Path | None = None) -> None:
+        """Starts the daemon of a node, which may not see a folder."""
+        command = ["slurmd", "-D", "-N", name]
+        if blind_to is not None:
+            hidden = f'mount -t tmpfs none "{blind_to}" && exec "$@"'
+            command = ["unshare", "-m", "sh", "-c", hidden, "sh", *command]
+        self._start(name, command, {_NODE_MARK: name})
+
+    def wait_until_idle(self) -> None:
+        """Waits until all nodes are there, without a job."""
+        wait_for("two idle nodes", self._is_ready)
 
     def stop(self) -> None:
         """Ends the jobs and every daemon."""
@@ -162,7 +184,7 @@ class Slurm:
     def _write_configuration(self) -> None:
         for name in ("state", "database"):
             (self.folder / name).mkdir()
-        ports = _free_ports(3 + len(NODES))
+        ports = free_ports(3 + len(NODES))
         values = {
             "host": socket.gethostname(),
             "user": getpass.getuser(),
@@ -201,13 +223,13 @@ class Slurm:
                 f"--log-file={folder}/munge.log",
             ],
         )
-        _wait_for("munged", (folder / "munge.socket").exists)
+        wait_for("munged", (folder / "munge.socket").exists)
         if self.accounting:
             self._start_database()
         self._start("slurmctld", ["slurmctld", "-D"])
         for name in NODES:
             self.start_node(name)
-        _wait_for("slurm", self._is_ready)
+        wait_for("slurm", self._is_ready)
 
     def _start_database(self) -> None:
         """Starts the database of ended jobs, and what writes to it."""
@@ -232,9 +254,9 @@ class Slurm:
              "--bind-address=127.0.0.1", f"--port={self._mysql_port}",
              f"--init-file={first}", "--skip-name-resolve"],
         )  # fmt: skip
-        _wait_for("mariadbd", lambda: _answers(self._mysql_port))
+        wait_for("mariadbd", lambda: answers(self._mysql_port))
         self._start("slurmdbd", ["slurmdbd", "-D"])
-        _wait_for("slurmdbd", self._has_accounts)
+        wait_for("slurmdbd", self._has_accounts)
 
     def _has_accounts(self) -> bool:
         listed = subprocess.run(
@@ -255,79 +277,15 @@ class Slurm:
         ).stdout.split()
         return states.count("idle") == len(NODES)
 
-    def _start(self, name: str, command: Sequence[str]) -> None:
+    def _start(
+        self, name: str, command: Sequence[str], marks: Mapping[str, str] | None = None
+    ) -> None:
         with (self.folder / f"{name}.out").open("ab") as output:
             self._daemons[name] = subprocess.Popen(
                 command,
-                env=self.environment,
+                env=self.environment | dict(marks or {}),
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
                 start_new_session=True,
             )
-
-    def _processes_of(self, node: str) -> list[int]:
-        """Returns the processes of the jobs of a node."""
-        spool = str(self.folder / f"spool-{node}").encode()
-        named = f"SLURMD_NODENAME={node}".encode()
-        conf = f"SLURM_CONF={self.folder}/slurm.conf".encode()
-        found = []
-        for path in Path("/proc").glob("[0-9]*"):
-            try:
-                environment = (path / "environ").read_bytes().split(b"\0")
-                words = (path / "cmdline").read_bytes()
-            except OSError:
-                continue
-            if (named in environment and conf in environment) or spool in words:
-                found.append(int(path.name))
-        return found
-
-
-def _kill_tree(root: int, among: Sequence[int]) -> None:
-    """Kills a process, its descendants, and others that belong to it.
-
-    From the top, so that none can tell what happened to those below it.
-    """
-    for process in [root, *_descendants(root), *among]:
-        try:
-            os.kill(process, signal.SIGKILL)
-        except ProcessLookupError:
-            continue
-
-
-def _descendants(root: int) -> list[int]:
-    parents = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = path.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        parents[int(path.parent.name)] = int(fields[1])
-    found = [root]
-    for process in found:
-        found += [child for child, parent in parents.items() if parent == process]
-    return found[1:]
-
-
-def _free_ports(count: int) -> list[int]:
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports = [each.getsockname()[1] for each in sockets]
-    for each in sockets:
-        each.close()
-    return ports
-
-
-def _answers(port: int) -> bool:
-    try:
-        socket.create_connection(("127.0.0.1", port), 1).close()
-    except OSError:
-        return False
-    return True
-
-
-def _wait_for(what: str, ready) -> None:
-    deadline = time.monotonic() + _PATIENCE
-    while not ready():
-        if time.monotonic() > deadline:
-            raise TimeoutError(f"{what} does not answer after {_PATIENCE:.0f} s")
-        time.sleep(0.2)

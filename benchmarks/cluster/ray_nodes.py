@@ -1,0 +1,105 @@
+"""Starts a real cluster of Ray of two nodes on this machine, and stops it again."""
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+from benchmarks.cluster.processes import descendants, free_ports, kill, wait_for
+
+_NAMES = ("head", "second")
+_ADDRESSES = {"head": "127.0.0.1", "second": "127.0.0.2"}
+_STORE = 100_000_000  # [bytes] of objects; a sweep has next to none
+
+
+def missing() -> list[str]:
+    """Returns what a cluster needs and this environment lacks."""
+    found = Path(sys.executable).with_name("ray").exists()
+    return [] if found else ["ray (pip install 'gpmpc[ray]')"]
+
+
+class RayNodes:
+    """A cluster of two raylets; a context in which it runs.
+
+    Args:
+        folder: Where it keeps everything; short, since it names sockets.
+        blind_to: A folder that the second node does not see.
+    """
+
+    def __init__(self, folder: Path, blind_to: Path | None = None):
+        self.folder = folder
+        self.blind_to = blind_to
+        self.environment = os.environ | {
+            "RAY_AUTH_MODE": "disabled",
+            "RAY_USAGE_STATS_ENABLED": "0",
+        }
+        (self._port,) = free_ports(1)
+        self._daemons: dict[str, subprocess.Popen] = {}
+
+    @property
+    def address(self) -> str:
+        """Where a sweep finds it."""
+        return f"{_ADDRESSES['head']}:{self._port}"
+
+    def __enter__(self) -> "RayNodes":
+        try:
+            for name in _NAMES:
+                self.start_node(name)
+        except BaseException:
+            self.stop()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def start_node(self, name: str) -> None:
+        """Starts a raylet, the first one with the head, and waits until it is there."""
+        ray = str(Path(sys.executable).with_name("ray"))
+        command = [
+            ray, "start", "--block", "--num-cpus=2", "--disable-usage-stats",
+            f"--node-ip-address={_ADDRESSES[name]}",
+            f"--object-store-memory={_STORE}",
+        ]  # fmt: skip
+        if name == "head":
+            command += [
+                "--head",
+                f"--port={self._port}",
+                "--include-dashboard=false",
+                f"--temp-dir={self.folder}",
+                "--min-worker-port=0",
+                "--max-worker-port=0",
+            ]
+        else:
+            command.append(f"--address={self.address}")
+            if self.blind_to is not None:
+                hidden = f'mount -t tmpfs none "{self.blind_to}" && exec "$@"'
+                command = ["unshare", "-m", "sh", "-c", hidden, "sh", *command]
+        self.folder.mkdir(parents=True, exist_ok=True)
+        log = self.folder.with_name(f"{self.folder.name}-{name}.out")
+        with log.open("wb") as output:
+            self._daemons[name] = subprocess.Popen(
+                command,
+                env=self.environment,
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,
+            )
+        wait_for(f"ray, {name}", lambda: "Ray runtime started" in log.read_text())
+
+    def kill_node(self, name: str) -> None:
+        """Kills a raylet with all that it started, as a power cut would."""
+        daemon = self._daemons.pop(name)
+        kill([*descendants(daemon.pid), daemon.pid])
+        daemon.wait()
+
+    def stop(self) -> None:
+        """Ends both nodes."""
+        for name in reversed(_NAMES):
+            if name in self._daemons:
+                self.kill_node(name)
+        time.sleep(1.0)
+        shutil.rmtree(self.folder, ignore_errors=True)
