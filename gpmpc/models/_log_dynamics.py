@@ -2,12 +2,14 @@
 
     x[k+1] = kinematics.step(x[k], y(x[k], u[k]))
 
+Where inputs act late, through lags, or past rows are remembered, the state holds that
+as well, behind what is measured; ``augmented`` fills it with what was measured.
 Derivatives are central differences, all points in one batch. The disturbance from the
 past is left to the controller's own estimate.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,10 +17,12 @@ import torch
 from torch import Tensor
 
 from gpmpc._angles import full_turns
+from gpmpc._arrays import read_array
 from gpmpc._dynamics import Array, Linearized, check_query, to_array
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models._log_model import LogModel
+from gpmpc.models._windows import Windows
 from gpmpc.signals import UNKNOWN, Signals
 
 #: of the coloured noise of outputs [s]; zero is white
@@ -40,7 +44,7 @@ class LogDynamics:
     """A model of a log as a ``DynamicsModel``.
 
     Raises:
-        SettingError: Its inputs act late, or it has a term of the controller that flew.
+        SettingError: It has a term of the controller that flew.
     """
 
     model: LogModel  #: without context
@@ -53,22 +57,76 @@ class LogDynamics:
 
     def __post_init__(self) -> None:
         reason = ""
-        if self.model.lag or len(self.model.time_constants):
-            reason = "has inputs that act late"
-        elif not self.model.memory.empty:
-            reason = "remembers past rows"
-        elif getattr(self.model.nominal, "feedback", False):
+        if getattr(self.model.nominal, "feedback", False):
             reason = "holds the feedback of the controller that flew"
         if reason:
             rule = "which no controller can plan with: gpmpc learn --for-control"
             raise SettingError("model", f"{reason}, {rule}")
 
     @property
-    def state_dim(self) -> int:
-        """Number of states, n; four of an attitude."""
+    def measured_dim(self) -> int:
+        """Number of the states that are measured; four of an attitude."""
         return self.model.kinematics.space.dim
 
+    @cached_property
+    def carried_dim(self) -> int:
+        """Number of states beyond these: inputs on their way, and what is remembered.
+
+        They are known from past rows.
+        """
+        return self.model.carried_dim(self.input_dim)
+
+    @property
+    def state_dim(self) -> int:
+        """Number of states, n: those that are measured and those beyond."""
+        return self.measured_dim + self.carried_dim
+
     output_dim = state_dim
+
+    def augmented(self, states: Array, inputs: Array) -> Array:
+        """Returns the state (n,) after measured rows.
+
+        Where there are fewer rows than the model looks back, it was at rest before
+        them: as in the first row.
+
+        Args:
+            states: Measured states, the last one that of now (P + 1, measured_dim).
+            inputs: Those that were applied between them (P, m).
+
+        Raises:
+            ShapeError: The two do not belong together.
+        """
+        states = read_array("states", states)
+        inputs = read_array("inputs", inputs)
+        count = len(states)
+        shapes = (count, self.measured_dim), (count - 1, self.input_dim)
+        if not count or (states.shape, inputs.shape) != shapes:
+            rule = "states (P + 1, n) and inputs (P, m) must be rows of one flight"
+            raise ShapeError(f"{rule}; got {states.shape} and {inputs.shape}")
+        past = self.model.past
+        missing = max(past - len(inputs), 0)
+        first_input = inputs[:1] if len(inputs) else np.zeros((1, self.input_dim))
+        states = np.concatenate([np.repeat(states[:1], missing, axis=0), states])
+        inputs = np.concatenate([np.repeat(first_input, missing, axis=0), inputs])
+        states = states[-past - 1 :]
+        inputs = inputs[len(inputs) - past :]
+        window = Windows(
+            space=self.model.kinematics.space,
+            time_step=self.time_step,
+            past=past,
+            stride=1,
+            states=states[None],
+            inputs=np.concatenate([inputs, inputs[-1:]])[None],
+            context=np.empty((1, past + 1, 0)),
+            runs=np.zeros(1),
+            times=np.zeros(1),
+        )
+        return self._unfiltered.recall(window)[0]
+
+    @cached_property
+    def _unfiltered(self) -> LogModel:
+        """The model that begins where it is measured: a loop filters by itself."""
+        return replace(self.model, start_filter=None)
 
     @property
     def angles(self) -> Sequence[int]:
@@ -86,13 +144,14 @@ class LogDynamics:
         if self.noise is None:
             return torch.zeros(n, n, dtype=torch.float64)
         space = self.model.kinematics.space
-        origin = space.origin[None]
-        no_outputs = np.zeros((1, self.noise.outputs.shape[1]))
-        B = self._derivatives_by_outputs(origin, no_outputs)[0]
+        origin = np.zeros((1, n))
+        origin[:, : space.dim] = space.origin
+        B = self._derivatives_by_outputs(origin, np.zeros((1, self.input_dim)))[0]
         h = DIFFERENCE * np.eye(space.error_dim)
-        forward = space.displace(origin, h)
-        backward = space.displace(origin, -h)
-        D = (forward - backward).T / (2 * DIFFERENCE)
+        forward = space.displace(space.origin[None], h)
+        backward = space.displace(space.origin[None], -h)
+        D = np.zeros((n, space.error_dim))  # what is remembered has no noise of its own
+        D[: space.dim] = (forward - backward).T / (2 * DIFFERENCE)
         by_outputs = B * self.noise.outputs.sum(axis=0) @ B.T
         covariance = by_outputs + D * self.noise.measurement @ D.T
         return torch.from_numpy((covariance + covariance.T) / 2)
@@ -132,39 +191,46 @@ class LogDynamics:
             covariance=V,
         )
 
-    def _mean(self, x: Array, u: Array) -> Array:
+    def _mean(self, z: Array, u: Array) -> Array:
         """Computes the mean of the next states (K, n)."""
-        model = self.model
-        no_context = np.empty((len(x), 0))
-        y = model.outputs(x, u, no_context)
-        after = model.kinematics.step(x, y, self.time_step)
-        # Kinematics wrap angles; a plan counts their turns.
-        return after + full_turns(x - after, self.angles)
+        return self._step(z, u, 0.0)
 
-    def _covariance(self, x: Array, u: Array) -> Array:
+    def _step(self, z: Array, u: Array, disturbance: Array | float) -> Array:
+        """Moves states (K, n) by a step, with a disturbance of the outputs (o,)."""
+        no_context = np.empty((len(z), 0))
+        after = self.model.step(
+            z,
+            inputs=u,
+            context=no_context,
+            time_step=self.time_step,
+            disturbance=disturbance,
+        )
+        # Kinematics wrap angles; a plan counts their turns.
+        return after + full_turns(z - after, self.angles)
+
+    def _covariance(self, z: Array, u: Array) -> Array:
         """Computes the covariance of the next states (K, n, n), by that of the GPs."""
         model = self.model
-        K = len(x)
+        K = len(z)
         if not model.gps:
             return np.zeros((K, self.state_dim, self.state_dim))
         no_context = np.empty((K, 0))
-        features = model.kinematics.features(x, u, no_context)
-        features = np.ascontiguousarray(features)
-        y = model.outputs(x, u, no_context)
-        V = np.zeros((K, y.shape[1], y.shape[1]))
-        for gp in model.gps:
+        points = model.seen_by_gps(z, u, no_context, self.time_step)
+        o = len(model.history)
+        V = np.zeros((K, o, o))
+        for gp, seen in zip(model.gps, points, strict=True):
             block = np.ix_(range(K), gp.outputs, gp.outputs)
-            prediction = gp.posterior.linearize(features, no_context, covariance=True)
+            prediction = gp.posterior.linearize(
+                np.ascontiguousarray(seen), no_context, covariance=True
+            )
             assert prediction.covariance is not None
             V[block] += prediction.covariance
-        B = self._derivatives_by_outputs(x, y)
+        B = self._derivatives_by_outputs(z, u)
         return B @ V @ B.mT
 
-    def _derivatives_by_outputs(self, x: Array, y: Array) -> Array:
+    def _derivatives_by_outputs(self, z: Array, u: Array) -> Array:
         """Computes the derivatives of the next states by the outputs (K, n, o)."""
-        step = self.model.kinematics.step
-        dt = self.time_step
         columns = []
-        for h in DIFFERENCE * np.eye(y.shape[1]):
-            columns.append(step(x, y + h, dt) - step(x, y - h, dt))
+        for h in DIFFERENCE * np.eye(len(self.model.history)):
+            columns.append(self._step(z, u, h) - self._step(z, u, -h))
         return np.stack(columns, axis=-1) / (2 * DIFFERENCE)

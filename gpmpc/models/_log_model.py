@@ -31,6 +31,7 @@ from gpmpc.models._roll_out import iterate
 from gpmpc.models._windows import Windows
 
 DIVERGED = 1e9  # error of a rollout that is not finite
+_LAG_ROWS = 20  # from which the state of first-order lags is known
 
 
 @dataclass(frozen=True)
@@ -100,8 +101,8 @@ class LogModel:
     @property
     def past(self) -> int:
         """Number of rows that a prediction needs before its start."""
-        rows = max(*self.history, self.memory.reach)
-        rows += self.lag + bool(len(self.time_constants))
+        lag_rows = _LAG_ROWS if len(self.time_constants) else 0
+        rows = max(*self.history, self.memory.reach, lag_rows) + self.lag
         if self.correction is None and self.start_filter is None:
             return rows
         return max(rows, *LAGS)
@@ -247,15 +248,7 @@ class LogModel:
         inputs = np.broadcast_to(inputs, (*batch, m))
         context = np.broadcast_to(context, (*batch, context.shape[-1]))
         queue = np.concatenate([parts.pending, inputs], axis=-1)
-        acting = queue[..., :m]
-        lagged = parts.lagged
-        if len(self.time_constants):
-            if time_constants is None:
-                time_constants = self.time_constants
-            lags = FirstOrderLags.of(time_constants, time_step)
-            delayed = acting
-            acting = lags.acting(lagged, delayed)
-            lagged = lags.after(lagged, delayed)
+        acting, lagged = self._act(parts, queue[..., :m], time_step, time_constants)
         memory = parts.memory
         states = parts.states
         learned = self.learned_outputs(states, acting, context, memory) + disturbance
@@ -266,6 +259,31 @@ class LogModel:
             learned = np.broadcast_to(learned, outputs.shape)
             memory = self.memory.step(memory, features, learned)
         return np.concatenate([after, lagged, queue[..., m:], memory], axis=-1)
+
+    def _act(
+        self, parts: StateParts, inputs: Array, time_step: float, time_constants: Any
+    ) -> tuple[Array, Array]:
+        """Returns the inputs as they act in a step, and the lags' state after it."""
+        if not len(self.time_constants):
+            return inputs, parts.lagged
+        if time_constants is None:
+            time_constants = self.time_constants
+        lags = FirstOrderLags.of(time_constants, time_step)
+        return lags.acting(parts.lagged, inputs), lags.after(parts.lagged, inputs)
+
+    def seen_by_gps(
+        self, carried: Array, inputs: Array, context: Array, time_step: float
+    ) -> list[Array]:
+        """Returns what each GP sees (..., d) in a step; see ``step``."""
+        m = inputs.shape[-1]
+        parts = self.parts(carried, m)
+        queue = np.concatenate([parts.pending, inputs], axis=-1)
+        acting, _ = self._act(parts, queue[..., :m], time_step, None)
+        features = self.features(parts.states, acting, context)
+        if not any(gp.sees_memory for gp in self.gps):
+            return [features] * len(self.gps)
+        regressors = self.memory.regressors(features, parts.memory)[..., :-1]
+        return [regressors if gp.sees_memory else features for gp in self.gps]
 
     def acting_inputs(
         self, windows: Windows, rows: slice, time_constants: Any = None

@@ -15,6 +15,7 @@ from gpmpc.models import LogDynamics, LogModel, MultirotorNominal, RigidBodyKine
 from gpmpc.models._kinematics import Increments
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import OutputGP
+from gpmpc.models._memory import Memory
 from gpmpc.models._parametric import AffineNominal
 from gpmpc.models._quaternions import rotation_quaternion
 from gpmpc.models._state_space import StateGroup, StateSpace
@@ -78,12 +79,42 @@ def test_what_was_learned_obeys_the_protocol_of_models():
 
 
 def test_what_no_controller_can_plan_with_is_named():
-    with pytest.raises(
-        SettingError, match="inputs that act 3 rows late, which no controller"
-    ):
-        dynamics(
-            RigidBodyKinematics(BODY), MultirotorNominal(4), np.zeros(6), 4, 12, lag=3
-        )
+    nominal = MultirotorNominal(4, feedback=True)
+    with pytest.raises(SettingError, match="feedback of the controller that flew"):
+        dynamics(RigidBodyKinematics(BODY), nominal, np.zeros(10), 4, 12)
+
+
+def test_a_model_with_a_past_has_it_in_its_state():
+    space = StateSpace((StateGroup("x", ("x", "y"), ""),))
+    kinematics = Increments(space)
+    memory = Memory(rows=2, decays=(0.8,), output_decays=(0.5,))
+    rng = np.random.default_rng(2)
+    regressors = memory.regressor_dim(3, 2)
+    model = dynamics(
+        kinematics, AffineNominal(kinematics, fitted=False), np.empty(0), 1, 3,
+        lag=1, time_constants=np.array([0.05]), memory=memory,
+        weights=0.1 * rng.normal(size=(2, regressors)),
+    )  # fmt: skip
+    carried = 1 + 1 + memory.dim(3, 2)  # of the lag, on its way, remembered
+    assert (model.measured_dim, model.state_dim) == (2, 2 + carried)
+    states = rng.normal(size=(30, 2))
+    inputs = rng.normal(size=(29, 1))
+    start = model.augmented(states[:-1], inputs[:-1])
+    np.testing.assert_array_equal(start[:2], states[-2])
+    assert start[3] == inputs[-2]  # it acts next
+    np.testing.assert_array_equal(start[4:6], states[-3])
+    np.testing.assert_array_equal(start[7:9], states[-4])
+    # What is on its way moves on as the measured rows say.
+    z = torch.from_numpy(start)
+    after = model.predict(z, torch.from_numpy(inputs[-1])).mean.numpy()
+    measured_after = model.augmented(states, inputs)
+    np.testing.assert_allclose(after[2:4], measured_after[2:4], atol=1e-2)
+    np.testing.assert_allclose(after[4:6], start[:2])
+    points = z + 0.1 * torch.from_numpy(rng.normal(size=(4, len(start))))
+    check_model(model, points, torch.from_numpy(rng.normal(size=(4, 1))))
+    # A flight that has just begun was at rest before.
+    first = model.augmented(states[:1], inputs[:0])
+    np.testing.assert_array_equal(first[4:6], states[0])
 
 
 def test_the_guide_flies_learns_and_flies_what_was_learned(tmp_path):
