@@ -17,6 +17,7 @@ from gpmpc._files import write_whole
 from gpmpc._provenance import code_fingerprint, provenance
 from gpmpc.cli._commands import Result
 from gpmpc.cli._settings import write_files, writing
+from gpmpc.cli._terminal import print_error
 from gpmpc.logs import IdentifiedModel, Judgement, Log
 from gpmpc.plotting import judgement_figure, png
 from gpmpc.studies._document import Document, Table, number, terminal
@@ -25,6 +26,7 @@ from gpmpc.studies.study import fingerprint
 
 _MODEL = "model.safetensors"
 _JUDGED_STEPS = (1, 10, 50)  # ahead, besides the longest
+_UNUSABLE = 3  # exit code of a model that is written, and should not be used
 _NOISE = (
     "the noise of the outputs, which adds up, and that of the sensors, which does not, "
     "as fitted to held-out rollouts"
@@ -34,7 +36,8 @@ _NOISE = (
 def learn(arguments: argparse.Namespace) -> Result:
     """Learns from logs, judges on held-out runs, and writes model, report and card.
 
-    The same command goes on where it stopped.
+    The same command goes on where it stopped. The exit code is 3 where the model that
+    was written should not be used.
     """
     console = Console(soft_wrap=True, highlight=False, markup=False)
     folder = arguments.to or Path("learned")
@@ -59,12 +62,40 @@ def learn(arguments: argparse.Namespace) -> Result:
     for line in judgement.losses:
         console.print(f"loses: {line}")
     console.print(f"written to {folder}: {_MODEL}, report.html, report.md, card.md")
+    reasons = _reasons_against(learned, judgement)
+    for reason in reasons:
+        print_error(f"do not use this model: {reason}")
+    for line in _advice(learned):
+        console.print(line)
     data = {
         "folder": str(folder),
+        "usable": not reasons,
+        "reasons": reasons,
         "losses": judgement.losses,
         "rows": report.data.to_dict("records"),
     }
-    return Result(data)
+    return Result(data, _UNUSABLE if reasons else 0)
+
+
+def _reasons_against(learned: IdentifiedModel, judgement: Judgement) -> tuple[str, ...]:
+    """Returns why a model should not be used; nothing where it may be.
+
+    A model for a controller is not asked to beat a regression that plans nothing, but
+    to know what the inputs do.
+    """
+    if learned.control is None:
+        return judgement.losses
+    losses = judgement.losses_to(logs.PLANNABLE_BASELINES)
+    return (*learned.control.faults, *losses)
+
+
+def _advice(learned: IdentifiedModel) -> tuple[str, ...]:
+    """Returns what else to know of a model for a controller, and what to fly."""
+    control = learned.control
+    if control is None:
+        return ()
+    warnings = tuple(f"for control: {warning}" for warning in control.warnings)
+    return (*warnings, *control.advice)
 
 
 def _learn_and_judge(
@@ -184,22 +215,34 @@ def _report(
 ) -> Document:
     """Returns errors beside the baselines, coverage and width, and every candidate."""
     notes = [
-        "A width of 1 claims the spread that the errors have; the interval in brackets "
-        "is the exact one of Clopper and Pearson for windows that do not overlap.",
+        "In brackets under a mean error stands the root mean square. A width of 1 "
+        "claims the spread that the errors have; the interval in brackets is the exact "
+        "one of Clopper and Pearson for windows that do not overlap.",
         f"Intervals hold {_NOISE}.",
+        f"Candidates were compared on held-out rows: {learned.folds}.",
     ]
     lists = {}
+    title = "What was learned, judged on runs that it never saw"
+    reasons = _reasons_against(learned, judgement)
+    if reasons:
+        title = f"This model should not be used: {reasons[0]}"
+        lists["Why the model should not be used"] = reasons
     if judgement.losses:
-        notes.append("The model loses to a baseline: see below.")
-        lists["Where the model loses"] = judgement.losses
+        lists["Where the model loses to what costs nothing"] = judgement.losses
     else:
-        notes.append("The model loses to no baseline.")
+        notes.append(
+            "The model loses to no baseline, by more than 2 % and more than chance."
+        )
+    if learned.control is not None:
+        lists["For control"] = [*learned.control.warnings, *learned.control.advice]
     runs = ", ".join(run.name for run in held_out)
     return Document(
-        title="What was learned, judged on runs that it never saw",
+        title=title,
         tables=[
             _table_of_errors(judgement),
             _table_of_intervals(judgement),
+            *_tables_of_effects(learned),
+            _table_of_comparisons(learned, judgement),
             _table_of_candidates(learned, judgement),
         ],
         data=judgement.to_pandas(),
@@ -256,6 +299,41 @@ def _table_of_candidates(learned: IdentifiedModel, judgement: Judgement) -> Tabl
     return Table(["", "model", *_groups(judgement)], rows, title)
 
 
+def _table_of_comparisons(learned: IdentifiedModel, judgement: Judgement) -> Table:
+    """Returns by how much the model won over the baselines and the second best."""
+    rows = []
+    for one in learned.comparisons:
+        for k, step in enumerate(learned.judged_steps):
+            texts = [
+                f"{one.ratio[k, g]:.3f}\n[{one.low[k, g]:.3f}, {one.high[k, g]:.3f}]"
+                for g in range(len(judgement.groups))
+            ]
+            rows.append([one.name, step, *texts])
+    title = (
+        "What won, by how much: its mean error over that of others, on held-out rows "
+        "of the training runs, with 95 % intervals over windows"
+    )
+    header = ["over that of", "steps ahead", *judgement.groups]
+    return Table(header, rows, title, sections=True)
+
+
+def _tables_of_effects(learned: IdentifiedModel) -> list[Table]:
+    """Returns a table of what the inputs do, where that was asked."""
+    if learned.control is None:
+        return []
+    rows = [
+        [
+            effect.input,
+            effect.output,
+            f"{number(effect.gain)}\n[{number(effect.low)}, {number(effect.high)}]",
+            effect.model,
+        ]
+        for effect in learned.control.effects
+    ]
+    header = ["input", "output that it moves most", "by the rows", "by the model"]
+    return [Table(header, rows, "What the inputs do: derivatives of the outputs")]
+
+
 def _card(
     learned: IdentifiedModel, judgement: Judgement, train: Log, held_out: Log
 ) -> Document:
@@ -270,10 +348,15 @@ def _card(
         for finding in train.findings
         if finding.run in learned.runs
     ]
+    reasons = _reasons_against(learned, judgement)
+    title = "Model card"
+    if reasons:
+        title = f"This model should not be used: {reasons[0]}"
     return Document(
-        title="Model card",
+        title=title,
         tables=[
             Table(["", ""], _facts(learned, train, held_out), "What it is"),
+            _table_of_comparisons(learned, judgement),
             Table(
                 ["parameter", "value", "standard error"],
                 learned.fit.to_rows(),
@@ -305,6 +388,7 @@ def _facts(
         ("rows", len(train)),
         ("runs", ", ".join(learned.runs)),
         ("rate", f"{1 / train.time_step:g} Hz"),
+        ("candidates compared on", learned.folds),
         ("judged on", ", ".join(run.name for run in held_out)),
         ("intervals hold", _NOISE),
         ("made", origin["created"]),
@@ -331,7 +415,20 @@ def _outputs(learned: IdentifiedModel) -> list[str]:
 def _doubts(learned: IdentifiedModel, judgement: Judgement) -> list[str]:
     """Returns what must not be trusted."""
     nominal = learned.model.nominal
-    doubts = [f"Loses to a baseline: {loss}" for loss in judgement.losses]
+    doubts = [*_reasons_against(learned, judgement)]
+    doubts += [
+        f"Loses to a baseline: {loss}"
+        for loss in judgement.losses
+        if loss not in doubts
+    ]
+    if learned.control is not None:
+        doubts += learned.control.warnings
+    if learned.model.correction is not None or learned.model.start_filter is not None:
+        doubts.append(
+            "Predictions begin at a state estimated from the rows before, and what the "
+            "past says may correct them: a controller plans with the movement alone, "
+            "from its own estimate."
+        )
     doubts.append("Outside the ranges below nothing was seen.")
     if getattr(nominal, "feedback", False):
         doubts.append(

@@ -22,14 +22,21 @@ How ``learn`` makes a model of a log:
 1. structures    ``_structures`` has the simplest models, and what they may grow by. To
                  add a structure, see there. The models themselves are those of
                  ``gpmpc.models``.
-2. parameters    ``_fitting`` fits nominal models on rollouts.
-3. residuals     ``_output_gps`` trains GPs on what a nominal model leaves.
-4. choice        ``_learning`` compares structures on held-out runs.
-5. noise         ``_noise`` finds the noise behind the errors of held-out rollouts.
+2. folds         ``_folds`` deals runs, or blocks of rows, to two folds.
+3. rows          ``_smoothing`` takes the noise from the rows that models are fitted to.
+4. parameters    ``_fitting`` fits nominal models on rollouts.
+5. residuals     ``_output_gps`` trains GPs on what a nominal model leaves.
+6. choice        ``_search`` compares structures on held-out rows, beside the baselines
+                 of ``_baselines``; ``_comparison`` says by how much one wins.
+7. noise         ``_noise`` finds the noise behind the errors of held-out rollouts.
 
-``_judging`` judges what was learned beside baselines; ``_storage`` stores it.
+``_learning`` holds these steps in their order. ``_judging`` judges what was learned
+beside baselines, ``_control_fitness`` whether a controller can plan with it;
+``_storage`` stores it.
 """
 
+from gpmpc.logs._baselines import PLANNABLE_BASELINES
+from gpmpc.logs._control_fitness import ControlFitness
 from gpmpc.logs._fitting import fit_nominal
 from gpmpc.logs._inspection import Inspection, inspect_log
 from gpmpc.logs._judging import Judgement, judge
@@ -45,6 +52,8 @@ from gpmpc.logs._storage import (
 )
 
 __all__ = [
+    "PLANNABLE_BASELINES",
+    "ControlFitness",
     "IdentifiedModel",
     "Inspection",
     "Judgement",

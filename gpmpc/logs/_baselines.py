@@ -12,6 +12,8 @@ from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._windows import Windows
 
 CONSTANT_STATE = "constant state"
+#: those that a controller could plan with
+PLANNABLE_BASELINES = (CONSTANT_STATE, "constant velocity", "least squares")
 _RIDGE_WINDOWS = 3000  # to which the ridge regression is fitted
 
 

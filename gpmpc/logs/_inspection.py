@@ -205,7 +205,7 @@ def _read_with(mapping: LogMapping | None, path: str | Path) -> _Reading:
         warning = f"with this mapping the log cannot be learned from: {error}"
         return _Reading(warnings=[warning], dependence={})
     warnings = [f"{finding.kind}: {finding.text}" for finding in log.findings]
-    return _Reading(warnings=warnings, dependence=_dependence(log))
+    return _Reading(warnings=warnings, dependence=input_dependence(log))
 
 
 def _check_times(
@@ -468,7 +468,7 @@ def _dependence_warnings(dependence: Mapping[str, float]) -> list[str]:
     ]
 
 
-def _dependence(log: Log) -> dict[str, float]:
+def input_dependence(log: Log) -> dict[str, float]:
     """Returns the share of each input's variance that the states explain.
 
     They explain it by a linear function of themselves and of their squares.

@@ -7,7 +7,7 @@ mean variance that is claimed over the root mean squared error. Coverage alone i
 a width of one is honest.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +17,7 @@ from scipy.special import ndtri
 
 from gpmpc._dynamics import Array
 from gpmpc.logs._baselines import baseline_errors
+from gpmpc.logs._comparison import Comparison, compare
 from gpmpc.logs._fitting import PAST
 from gpmpc.logs._learning import IdentifiedModel
 from gpmpc.logs._log import Log
@@ -26,6 +27,7 @@ from gpmpc.models._state_space import StateSpace
 from gpmpc.models._windows import Windows
 
 STEPS = (1, 10, 50)
+MOST = 1.02  # of a baseline's error, from which on a model loses to it
 LEVEL = 0.95
 MODEL = "model"  # name of the judged model among the predictors
 _WINDOWS = 1000
@@ -51,18 +53,34 @@ class Judgement:
     width: Array  #: claimed over actual root mean square (k, groups)
     windows: int  #: number of predictions
     level: float = LEVEL  #: of the intervals
+    #: errors of the model over those of each baseline, with intervals
+    comparisons: tuple[Comparison, ...] = ()
 
     @property
     def losses(self) -> tuple[str, ...]:
-        """Sentences on the errors that are larger than those of a baseline."""
-        model_errors = self.mean[MODEL]
+        """Sentences on the errors that are larger than those of a baseline.
+
+        They are by more than 2 %, and by more than chance.
+        """
+        return self.losses_to([comparison.name for comparison in self.comparisons])
+
+    def losses_to(self, baselines: Sequence[str]) -> tuple[str, ...]:
+        """Returns sentences on the errors that are larger than those of some baselines.
+
+        Args:
+            baselines: Their names.
+        """
         losses = []
-        for name, errors in self.mean.items():
-            for k, g in np.argwhere(model_errors > 1.001 * errors):
+        for one in self.comparisons:
+            if one.name not in baselines:
+                continue
+            for k, g in np.argwhere((one.ratio > MOST) & (one.low > 1.0)):
                 losses.append(
                     f"{self.groups[g]} {self.steps[k]} steps ahead: "
-                    f"{model_errors[k, g]:.3g} {self.units[g]}, "
-                    f"{name} {errors[k, g]:.3g}"
+                    f"{self.mean[MODEL][k, g]:.3g} {self.units[g]}, "
+                    f"{one.name} {self.mean[one.name][k, g]:.3g} "
+                    f"({one.ratio[k, g]:.2f} of it; "
+                    f"{one.low[k, g]:.2f} to {one.high[k, g]:.2f})"
                 )
         return tuple(losses)
 
@@ -126,6 +144,19 @@ def judge(
         coverage_interval=_coverage_intervals(coverage, windows, steps),
         width=np.sqrt(claimed / np.maximum(actual, 1e-300)),
         windows=len(windows),
+        comparisons=_comparisons(distances, windows),
+    )
+
+
+def _comparisons(
+    distances: Mapping[str, Array], windows: Windows
+) -> tuple[Comparison, ...]:
+    """Compares the errors of the model with those of each baseline."""
+    block = 2 * -(-windows.ahead // windows.stride)
+    return tuple(
+        compare(name, distances[MODEL], others, block=block, seed=0)
+        for name, others in distances.items()
+        if name != MODEL
     )
 
 

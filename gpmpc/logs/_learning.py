@@ -18,6 +18,7 @@ from gpmpc._dynamics import Array
 from gpmpc.exceptions import check_number
 from gpmpc.gp._wrapped import warn_of_turns
 from gpmpc.logs._comparison import Comparison
+from gpmpc.logs._control_fitness import ControlFitness, judge_for_control
 from gpmpc.logs._fitting import STEPS, NominalFit
 from gpmpc.logs._folds import split_folds
 from gpmpc.logs._log import Log
@@ -47,6 +48,8 @@ class IdentifiedModel:
     folds: str = ""  #: how the log was split to compare them
     #: errors of the model over those of others, on the held-out rows of the folds
     comparisons: tuple[Comparison, ...] = ()
+    #: whether a controller can plan with it, where that was asked; no file keeps it
+    control: ControlFitness | None = None
 
 
 def learn(
@@ -71,7 +74,7 @@ def learn(
             with equal arguments are not computed again.
         for_control: Leaves out what predicts such runs and no controller can plan with:
             the feedback of the controller that flew, inputs that act late, and the
-            correction by the past.
+            correction by the past. Judges what the inputs do.
 
     Raises:
         DataError: The log is too short for rollouts of that many steps.
@@ -100,6 +103,10 @@ def learn(
     noise = search.fit_noise()
     progress("the chosen structure, fitted to all runs")
     fit = search.fit_to_all_runs()
+    control = None
+    if for_control:
+        progress("what the inputs do, by the model and by the rows")
+        control = judge_for_control(fit.model, log, search.rivals())
     return IdentifiedModel(
         model=fit.model,
         noise=noise,
@@ -114,6 +121,7 @@ def learn(
         judged_steps=search.judged_steps,
         folds=folds.sentence,
         comparisons=comparisons,
+        control=control,
     )
 
 

@@ -588,6 +588,20 @@ class Search:
             for name, other in others.items()
         )
 
+    def rivals(self) -> dict[str, LogModel]:
+        """Returns a model of the best structure of every other base, by its name.
+
+        Those whose outputs are the same whatever the inputs are left out.
+        """
+        best = self.best
+        rivals: dict[str, Structure] = {}
+        for structure in self._ranked(self._structures.values()):
+            nominal = structure.model.nominal
+            is_still = isinstance(nominal, AffineNominal) and not nominal.fitted
+            if structure.base != best.base and not (is_still or structure.penalties):
+                rivals.setdefault(structure.base, structure)
+        return {one.name: self._models(one)[0] for one in rivals.values()}
+
     def fit_noise(self) -> OutputNoise:
         """Fits the noise of the best structure to the held-out runs."""
         held_out = [fold.held_out for fold in self._folds]

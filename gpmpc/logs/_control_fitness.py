@@ -1,0 +1,256 @@
+"""Judges whether a controller can plan with a model that was learned from a log.
+
+A controller asks what its inputs do, and predicts little by what usually happens. So
+the effects of the inputs on the outputs are found once more, by a regression on the
+rows themselves with intervals, and the derivatives of the model stand beside them. Of
+an input that only follows the states, or does not move, the rows cannot tell the
+effect; flights that can are named. And a feedback that is designed on the model has to
+stabilise the other candidates as well, about some states of the log.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import LinAlgError, solve_discrete_are
+
+from gpmpc._dynamics import Array
+from gpmpc.logs._inspection import FOLLOWS, input_dependence
+from gpmpc.logs._log import Log
+from gpmpc.logs._output_gps import choose_rows
+from gpmpc.models._log_model import LogModel
+
+_SIGNIFICANT = 3.0  # standard errors by which an effect has to differ from none
+_LEAST_EFFECT = 1e-3  # of an output's deviation
+_BLOCK = 50  # rows whose residuals are correlated
+_ROWS = 20_000  # that are looked at, at most
+_STATES = 6  # about which feedbacks are tried
+_DIFFERENCE = 1e-5
+_UNSTABLE = 1.002  # spectral radius
+_DITHER = 0.1  # standard deviation of an excitation over the range of an input
+
+
+@dataclass(frozen=True)
+class Effect:
+    """The effect of an input on the output that it moves most."""
+
+    input: str  #: its name
+    output: str  #: likewise
+    gain: float  #: of the output by the input, from the rows
+    low: float  #: of the 95 % interval
+    high: float  #: likewise
+    model: float  #: mean derivative of the model
+
+
+@dataclass(frozen=True)
+class ControlFitness:
+    """Whether a controller can plan with a model."""
+
+    effects: tuple[Effect, ...]  #: one of each input
+    faults: tuple[str, ...]  #: why no controller should plan with it
+    warnings: tuple[str, ...]  #: what else to know
+    advice: tuple[str, ...]  #: what to fly instead, where there are faults
+
+
+def judge_for_control(
+    model: LogModel, log: Log, rivals: Mapping[str, LogModel]
+) -> ControlFitness:
+    """Judges whether a controller can plan with a model.
+
+    Args:
+        model: With its parameters and GPs.
+        log: That it was fitted to.
+        rivals: Other models of the log, by their names.
+    """
+    stride = max(len(log) // _ROWS, 1)
+    windows = log.windows(1, stride=stride)
+    states = windows.states[:, 0]
+    inputs = windows.inputs[:, 0]
+    context = windows.context[:, 0]
+    measured = model.kinematics.outputs(states, windows.states[:, 1], log.time_step)
+    gains, errors = _gains(model, states, inputs, context, measured)
+    slopes = _mean_slopes(model, states, inputs, context)
+    deviation = np.maximum(measured.std(axis=0), 1e-12)
+    names = log.input_names
+    significance = np.abs(gains) / np.maximum(errors, 1e-300)
+    effects = []
+    for j, name in enumerate(names):
+        i = int(significance[:, j].argmax())
+        effects.append(
+            Effect(
+                input=name,
+                output=model.kinematics.output_names[i],
+                gain=float(gains[i, j]),
+                low=float(gains[i, j] - 1.96 * errors[i, j]),
+                high=float(gains[i, j] + 1.96 * errors[i, j]),
+                model=float(slopes[i, j]),
+            )
+        )
+    unknown = _unknown_effects(log, inputs, significance)
+    faults = [*unknown.values()]
+    moves = np.abs(slopes) * np.ptp(inputs, axis=0) / deviation[:, None]
+    if moves.max() < _LEAST_EFFECT:
+        faults.append("no output of the model depends on any input")
+    warnings = [
+        f"the model says {effect.model:.3g} for the effect of {effect.input} on "
+        f"{effect.output}, the rows {effect.low:.3g} to {effect.high:.3g}"
+        for effect in effects
+        if effect.input not in unknown
+        and not _agree(effect.model, effect.low, effect.high)
+    ]
+    warnings += _unstable_loops(model, log, rivals)
+    advice = _excitation(log, names, inputs) if faults else ()
+    return ControlFitness(tuple(effects), tuple(faults), tuple(warnings), advice)
+
+
+def _agree(model: float, low: float, high: float) -> bool:
+    """Returns whether a derivative is about inside an interval, or has its sign."""
+    half = (high - low) / 2
+    centre = (high + low) / 2
+    return abs(model - centre) <= 2 * half + 0.5 * abs(centre)
+
+
+def _gains(
+    model: LogModel, states: Array, inputs: Array, context: Array, measured: Array
+) -> tuple[Array, Array]:
+    """Regresses outputs on features; returns the inputs' gains and standard errors.
+
+    Both are (o, m). Residuals may be correlated within blocks of rows.
+    """
+    features = model.kinematics.features(states, inputs, context)
+    m = inputs.shape[1]
+    first = features.shape[1] - context.shape[1] - m
+    deviation = np.maximum(features.std(axis=0), 1e-12)
+    z = (features - features.mean(axis=0)) / deviation
+    z = np.column_stack([z, np.ones(len(z))])
+    inverse = np.linalg.pinv(z.T @ z, rcond=1e-10)
+    weights = inverse @ (z.T @ measured)  # (f + 1, o)
+    residuals = measured - z @ weights
+    columns = slice(first, first + m)
+    gains = (weights[columns] / deviation[columns, None]).T
+    influence = z @ inverse[:, columns]  # (N, m)
+    scores = influence[:, None, :] * residuals[:, :, None]  # (N, o, m)
+    blocks = np.add.reduceat(scores, np.arange(0, len(scores), _BLOCK))
+    errors = np.sqrt(np.square(blocks).sum(axis=0)) / deviation[columns]
+    return gains, errors
+
+
+def _mean_slopes(
+    model: LogModel, states: Array, inputs: Array, context: Array
+) -> Array:
+    """Computes the mean derivatives of a model's outputs by the inputs (o, m)."""
+    every = max(len(states) // 1000, 1)
+    x = states[::every]
+    u = inputs[::every]
+    c = context[::every]
+    columns = []
+    for h in _DIFFERENCE * np.diag(np.maximum(np.ptp(inputs, axis=0), 1e-6)):
+        change = model.outputs(x, u + h, c) - model.outputs(x, u - h, c)
+        columns.append(change.mean(axis=0) / (2 * h.sum()))
+    return np.stack(columns, axis=-1)
+
+
+def _unknown_effects(log: Log, inputs: Array, significance: Array) -> dict[str, str]:
+    """Returns the inputs whose effect the rows cannot tell, with the reason."""
+    dependence = input_dependence(log)
+    reasons = {}
+    for j, name in enumerate(log.input_names):
+        variance = float(inputs[:, j].var())
+        if variance <= 1e-20 * max(float(np.square(inputs[:, j]).mean()), 1e-300):
+            reasons[name] = f"{name} does not move in the log: its effect is not known"
+            continue
+        followed = dependence.get(name, 0.0)
+        if followed > FOLLOWS:
+            reasons[name] = (
+                f"{name} follows the states ({followed:.1%} of its variance): what it "
+                "does by itself is not known"
+            )
+        elif significance[:, j].max() < _SIGNIFICANT:
+            reasons[name] = (
+                f"no effect of {name} shows in the log: it moves too little, or it has "
+                "none"
+            )
+    return reasons
+
+
+def _excitation(log: Log, names: Sequence[str], inputs: Array) -> tuple[str, ...]:
+    """Returns what to fly, so that the effects of the inputs can be told."""
+    widths = np.ptp(inputs, axis=0)
+    magnitudes = np.abs(inputs).max(axis=0)
+    widths = np.where(widths > 0, widths, np.where(magnitudes > 0, magnitudes, 1.0))
+    dither = ", ".join(f"{_DITHER * width:.2g}" for width in widths)
+    seconds = max(60.0, 500 * log.time_step)
+    return (
+        f"fly again for {seconds:.0f} s with noise added to the inputs "
+        f"({', '.join(names)}), a tenth of the range that each has in this log: "
+        f"gpmpc run ... noise.input=[{dither}] steps={seconds / log.time_step:.0f}",
+    )
+
+
+def _unstable_loops(
+    model: LogModel, log: Log, rivals: Mapping[str, LogModel]
+) -> list[str]:
+    """Tries feedbacks designed on a model on the other candidates.
+
+    They are of linear quadratic regulators about some states of the log, in units of
+    the deviations that states and inputs have in it.
+    """
+    windows = log.windows(1)
+    states = windows.states[:, 0]
+    inputs = windows.inputs[:, 0]
+    features = model.kinematics.features(states, inputs, windows.context[:, 0])
+    rows = choose_rows(features, _STATES)
+    points = states[rows], inputs[rows], windows.context[rows, 0]
+    spread = model.kinematics.space.difference(states, states[:1]).std(axis=0)
+    Q = np.diag(1 / np.maximum(spread, 1e-9) ** 2)
+    R = np.diag(1 / np.maximum(inputs.std(axis=0), 1e-9) ** 2)
+    A, B = _linearize(model, *points, log.time_step)
+    sentences = []
+    for name, rival in rivals.items():
+        rival_A, rival_B = _linearize(rival, *points, log.time_step)
+        tried = 0
+        unstable = 0
+        for k in range(len(rows)):
+            K = _regulator(A[k], B[k], Q, R)
+            if K is None:
+                continue
+            tried += 1
+            loop = np.linalg.eigvals(rival_A[k] - rival_B[k] @ K)
+            unstable += bool(np.abs(loop).max() > _UNSTABLE)
+        if unstable > tried / 2:
+            sentences.append(
+                f"a feedback designed on the model makes the candidate {name!r} "
+                f"unstable about {unstable} of {tried} states of the log"
+            )
+    return sentences
+
+
+def _regulator(A: Array, B: Array, Q: Array, R: Array) -> Array | None:
+    """Returns the gain of u = -K x; None where there is none that stabilises."""
+    try:
+        P = solve_discrete_are(A, B, Q, R)
+    except (LinAlgError, ValueError):
+        return None
+    return np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+
+
+def _linearize(
+    model: LogModel, states: Array, inputs: Array, context: Array, time_step: float
+) -> tuple[Array, Array]:
+    """Linearises one step about states: derivatives (K, e, e) and (K, e, m)."""
+    space = model.kinematics.space
+
+    def predict(x: Array, u: Array) -> Array:
+        return model.kinematics.step(x, model.outputs(x, u, context), time_step)
+
+    by_state = []
+    for h in _DIFFERENCE * np.eye(space.error_dim):
+        forward = predict(space.displace(states, h), inputs)
+        backward = predict(space.displace(states, -h), inputs)
+        by_state.append(space.difference(forward, backward) / (2 * _DIFFERENCE))
+    by_input = []
+    for h in _DIFFERENCE * np.eye(inputs.shape[1]):
+        forward = predict(states, inputs + h)
+        backward = predict(states, inputs - h)
+        by_input.append(space.difference(forward, backward) / (2 * _DIFFERENCE))
+    return np.stack(by_state, axis=-1), np.stack(by_input, axis=-1)
