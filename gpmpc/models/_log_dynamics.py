@@ -59,9 +59,8 @@ class LogDynamics:
         reason = ""
         if getattr(self.model.nominal, "feedback", False):
             reason = "holds the feedback of the controller that flew"
-        elif getattr(self.model.nominal, "fitted", True) is False:
-            if not self.model.gps:
-                reason = "moves in the same way whatever the inputs are"
+        elif not (self.model.gps or getattr(self.model.nominal, "fitted", True)):
+            reason = "moves in the same way whatever the inputs are"
         if reason:
             rule = "which no controller can plan with: gpmpc learn --for-control"
             raise SettingError("model", f"{reason}, {rule}")
