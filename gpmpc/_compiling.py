@@ -25,8 +25,9 @@ def report_compilation() -> Iterator[None]:
             if not self.started:
                 self.started = True
                 print(
-                    "compiling numerical kernels: once on this machine, about half a "
-                    "minute",
+                    "compiling numerical kernels for about half a minute: once on "
+                    "this machine for this kind of controller (gpmpc warmup does it "
+                    "for all)",
                     flush=True,
                 )
             super().on_start(event)

@@ -68,12 +68,13 @@ def beyond_data(model: DynamicsModel, reference: Any) -> list[BeyondData]:
     signals = signals_of(model)
     states = np.atleast_2d(read_reference(reference).in_order(signals).states)
     states = np.asarray(states, dtype=float)
-    if states.shape[-1] != model.state_dim:
+    columns = _columns(model)
+    if columns and states.shape[-1] != model.state_dim:
         raise ShapeError(
             f"reference must have {model.state_dim} states; got {states.shape[-1]}"
         )
     beyond = []
-    for column in _columns(model):
+    for column in columns:
         values = states[:, column.state]
         if column.angle:
             middle = 0.5 * (column.low + column.high)

@@ -73,10 +73,11 @@ def draw_quartiles(
     scale = _position_scale(positions)
     # Lines stand side by side, so that their quartiles do not hide each other.
     distance = min(0.14, 0.7 / max(len(lines), 1)) * scale.gap
+    places = _places_side_by_side(lines)
     for i, line in enumerate(lines):
         if not any(line.values):  # a line of failed runs alone
             continue
-        centres = scale.coordinates + (i - (len(lines) - 1) / 2) * distance
+        centres = scale.coordinates + distance * places[i]
         colour = COLOURS[i % len(COLOURS)]
         _draw_medians(axis, line, centres, scale, colour)
         _draw_values(axis, line, centres, scale, colour, width=0.3 * distance)
@@ -88,6 +89,16 @@ def draw_quartiles(
     )
     axis.xaxis.set_minor_locator(NullLocator())
     axis.set_xlim(*scale.limits())
+
+
+def _places_side_by_side(lines: Sequence[Series]) -> np.ndarray:
+    """Returns how far each line stands from the middle of each position, in distances.
+
+    Only lines with values at a position share it: one alone stands on its tick.
+    """
+    has_values = np.array([[bool(group) for group in line.values] for line in lines])
+    rank = has_values.cumsum(axis=0) - 1
+    return rank - (has_values.sum(axis=0) - 1) / 2
 
 
 @dataclass(frozen=True)

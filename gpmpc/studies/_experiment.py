@@ -170,7 +170,7 @@ class Experiment:
         return len(self.system.state_names), len(self.system.input_names)
 
     def _check_functions(self) -> None:
-        """Raises unless training and controller are made when the data are there."""
+        """Raises unless controller and training are functions of models and data."""
         if not callable(self.controller):
             raise SettingError(
                 "controller",
@@ -178,8 +178,7 @@ class Experiment:
                 "functools.partial(GPMPC, propagator=..., problem=..., ...); "
                 f"got {type(self.controller).__name__}",
             )
-        trains = self.learns and self.model is None
-        if not callable(self.train) and (trains or self.train is not None):
+        if not (self.train is None or callable(self.train)):
             raise SettingError(
                 "train", f"must be a function, such as Trainer(); got {self.train!r}"
             )

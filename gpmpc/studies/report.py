@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -45,6 +46,8 @@ _SHORT_LABELS = {
     "failed": "failed",
     "decision": "decision",
 }
+# What a value means, where a setting calls it otherwise.
+_WORDS = {("data.size", "null"): "all"}
 _QUARTILES = ("q25", "median", "q75")
 _MOST_LINES = 8  # in a figure; what is varied besides is pooled
 _LEGEND = (
@@ -231,9 +234,16 @@ def _table(report: Report, measures: Sequence[str]) -> Table:
             MISSING if np.isnan(of_measure).any() else with_range(*of_measure)
             for of_measure in quartiles[cell]
         ]
-        rows.append([*(values or ("all",)), _seeds(counts[cell]), *numbers])
+        shown = _shown(report, values) or ("all",)
+        rows.append([*shown, _seeds(counts[cell]), *numbers])
     labels = [report.measures[name] for name in measures]
     return Table([*_variables(report), "seeds", *labels], rows)
+
+
+def _shown(report: Report, values: Sequence[Any]) -> tuple[str, ...]:
+    """Returns the values of a cell's variables in words: no size means all rows."""
+    pairs = zip(report.variables, values, strict=True)
+    return tuple(_WORDS.get((name, str(value)), str(value)) for name, value in pairs)
 
 
 def _variables(report: Report) -> tuple[str, ...]:
@@ -304,7 +314,10 @@ def _figure(report: Report, index: int, measure: str) -> bytes:
         series.append(Series(figure_label(label), by_position))
     figure = over_variable(
         figure_label(report.variables[index]),
-        [figure_label(position) for position in positions],
+        [
+            figure_label(_WORDS.get((report.variables[index], str(position)), position))
+            for position in positions
+        ],
         figure_label(report.measures[measure]),
         series,
         _FIGURES[measure],
@@ -325,7 +338,8 @@ def _lines(report: Report, index: int) -> dict[str, list[int]]:
         others.remove(max(others, key=lambda i: _count_values(report, [i])))
     lines: dict[str, list[int]] = {}
     for cell, values in enumerate(report.cells):
-        label = ", ".join(f"{report.variables[i]}={values[i]}" for i in others)
+        shown = _shown(report, values)
+        label = ", ".join(f"{report.variables[i]}={shown[i]}" for i in others)
         lines.setdefault(label or "all", []).append(cell)
     return lines
 

@@ -448,3 +448,15 @@ def test_an_axis_places_numbers_by_value_and_words_in_order(positions, scale, pl
     assert [label.get_text() for label in axis.get_xticklabels()] == positions
     low, high = axis.get_xlim()
     assert all(low < x < high for line in axis.lines for x in line.get_xdata())
+
+
+def test_no_size_means_all_rows(tmp_path):
+    for size in ("25", "null"):
+        choices, settings = chosen("convex", 0, **{"data.size": size})
+        settings["data"] = {"size": None if size == "null" else int(size)}
+        made_up_run(tmp_path, choices, settings, result=metrics_of(0.1))
+    report = read_report(tmp_path)
+    assert report.variables == ("data.size",)
+    html = documents(report)["report.html"]
+    assert re.search(r"<td[^>]*>all</td>", html)
+    assert not re.search(r"<td[^>]*>null</td>", html)

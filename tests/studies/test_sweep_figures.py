@@ -25,3 +25,14 @@ def test_a_legend_stays_within_its_figure(label, count):
     box = legend.get_window_extent()
     assert box.x0 >= 0
     assert box.x1 <= figure.bbox.x1
+
+
+def test_a_lone_flight_stands_on_its_tick_and_others_side_by_side():
+    both = [Series("a", [[1.0], [2.0], []]), Series("b", [[1.0], [], [3.0]])]
+    figure = over_variable("controller", ["x", "y", "z"], "RMSE [m]", both)
+    (axis,) = figure.axes
+    centres = [line.get_xdata() for line in axis.lines if line.get_marker() == "o"]
+    assert [list(of_line) for of_line in centres] == [
+        [pytest.approx(-0.07), 1.0],
+        [pytest.approx(0.07), 2.0],
+    ]
