@@ -15,12 +15,15 @@ at the end. Exit code 1 where an act fails, or nothing could be played.
 
 import argparse
 import os
+import re
+import signal
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks.cluster import ray_nodes, slurm
-from benchmarks.cluster.acts import MANY, Stage, ray_acts, run, slurm_acts
+from benchmarks.cluster.acts import MANY, Act, Stage, ray_acts, run, slurm_acts
 from benchmarks.cluster.sweeps import Sweep
 
 _CLUSTERS = ("slurm", "slurm-accounting", "ray")
@@ -30,9 +33,11 @@ def main() -> int:
     """Plays the acts; returns the exit code."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--on", choices=_CLUSTERS, action="append", help="(all)")
-    parser.add_argument("--only", default="", help="acts whose name holds this text")
+    parser.add_argument("--only", default="", help="acts whose name holds this pattern")
     parser.add_argument("--runs", type=int, default=MANY, help="of the reference")
     arguments = parser.parse_args()
+    for number in (signal.SIGTERM, signal.SIGINT):  # what was started is stopped
+        signal.signal(number, lambda *_: sys.exit("stopped"))
     rows = []
     with tempfile.TemporaryDirectory(prefix="gpmpc-cluster-") as name:
         folder = Path(name)
@@ -69,11 +74,14 @@ def _play(cluster: str, stage: Stage, only: str) -> list[tuple[str, str, str, fl
         print(f"{cluster}: not here: {', '.join(missing)}", flush=True)
         return []
     if cluster == "ray":
-        acts = ray_acts(stage)
-        return run({name: acts[name] for name in acts if only in name}, cluster)
+        return run(_chosen(ray_acts(stage), only), cluster)
     with slurm.Slurm(stage.folder / cluster, accounting) as nodes:
-        acts = slurm_acts(stage, nodes)
-        return run({name: acts[name] for name in acts if only in name}, cluster)
+        return run(_chosen(slurm_acts(stage, nodes), only), cluster)
+
+
+def _chosen(acts: Mapping[str, Act], only: str) -> dict[str, Act]:
+    """Returns the acts whose names hold a pattern."""
+    return {name: act for name, act in acts.items() if re.search(only, name)}
 
 
 if __name__ == "__main__":

@@ -68,8 +68,8 @@ class Flying:
     repeated: set[str] = field(default_factory=set)
     #: runs that were ended from outside before, and fly once more; paths
     tried_again: list[str] = field(default_factory=list)
-    #: runs that were ended from outside too often, and do not fly; paths
-    given_up: list[str] = field(default_factory=list)
+    #: runs that were ended from outside too often, and do not fly; attempts by path
+    given_up: dict[str, int] = field(default_factory=dict)
     _open: dict[str, Job] = field(default_factory=dict)  # by path, not settled yet
     _failed_before: dict[str, int | None] = field(default_factory=dict)
     _begun_before: dict[str, int | None] = field(default_factory=dict)
@@ -88,7 +88,7 @@ class Flying:
         failed_at = job.folder.failed_at
         attempts = 0 if failed_at is None else job.folder.lost_attempts
         if attempts > self.retries:
-            self.given_up.append(path)
+            self.given_up[path] = attempts
             self.on_settled(job, RunState.FAILED)
             return
         if attempts:

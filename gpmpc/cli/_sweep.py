@@ -76,8 +76,8 @@ class Sweep:
         self.warnings: dict[Path, str] = {}
         #: folders of runs that were flown again, since their process was ended
         self.flown_again: set[str] = set()
-        #: folders of runs that were ended too often, and are not flown again
-        self.given_up: set[str] = set()
+        #: attempts of runs that were ended too often, and are not flown again, by folder
+        self.given_up: dict[str, int] = {}
 
     def close(self) -> None:
         """Ends the processes that wait for more runs."""
@@ -142,7 +142,7 @@ class Sweep:
         )
         flying.fly(job.with_absolute_path() for job in jobs if not job.folder.finished)
         self.flown_again |= {*flying.tried_again, *flying.repeated}
-        self.given_up |= {*flying.given_up}
+        self.given_up |= flying.given_up
         return outcomes
 
     def _outcome(self, job: Job, state: RunState) -> JobOutcome:
@@ -195,7 +195,7 @@ class Sweep:
             print_error(
                 f"{len(self.given_up)} of the runs were ended by a cluster or a crash "
                 f"more than {retries} times, and are not flown again; "
-                f"retries={retries + 1} flies them once more"
+                f"retries={max(self.given_up.values())} flies them once more"
             )
 
     def print_warnings(self) -> None:

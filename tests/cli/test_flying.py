@@ -144,7 +144,7 @@ def test_a_run_whose_process_dies_flies_again_as_often_as_allowed(cause, tmp_pat
 
     flying, states = flown(launcher, [jobs[0]], retries=1)
     assert states == {"0-flies": "failed"}
-    assert flying.given_up == [str(jobs[0].folder.path)]
+    assert flying.given_up == {str(jobs[0].folder.path): 2}
 
     flying, states = flown(launcher, [jobs[0]], retries=2)
     assert states == {"0-flies": "finished"}
