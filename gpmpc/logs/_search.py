@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpmpc._dynamics import Array
+from gpmpc.exceptions import DataError
 from gpmpc.logs._baselines import CONSTANT_STATE, baseline_errors
 from gpmpc.logs._comparison import Comparison, compare
 from gpmpc.logs._fit_form import fit_from
@@ -323,11 +324,14 @@ class Search:
 
         Upon a state that stays a GP is what ``gpmpc.gp.train`` makes of the rows.
         """
-        starts = self._ranked(self._structures.values())[:_BEAM]
+        ranked = self._ranked(self._structures.values())
+        # Of those without a memory, GPs see rows without noise.
+        plain = [one for one in ranked if one.model.memory.empty]
+        starts = [*ranked[:1], *[one for one in plain[:1] if one is not ranked[0]]]
         for base in self._bases:
             nominal = base.model.nominal
-            plain = isinstance(nominal, AffineNominal) and not nominal.fitted
-            if plain and base.base == "constant state" and base not in starts:
+            is_still = isinstance(nominal, AffineNominal) and not nominal.fitted
+            if is_still and base.base == "constant state" and base not in starts:
                 starts.append(base)
         return starts
 
@@ -603,22 +607,75 @@ class Search:
         return {one.name: self._models(one)[0] for one in rivals.values()}
 
     def fit_noise(self) -> OutputNoise:
-        """Fits the noise of the best structure to the held-out runs."""
-        held_out = [fold.held_out for fold in self._folds]
-        return fit_noise(self._models(self.best), held_out, self._steps)
+        """Fits the noise of the best structure to held-out runs.
+
+        Models of half the rows err more than the one of all: here three quarters are
+        fitted to, where there are rows enough.
+        """
+        try:
+            folds = self._quarters()
+        except DataError:
+            held_out = [fold.held_out for fold in self._folds]
+            return fit_noise(self._models(self.best), held_out, self._steps)
+        models = [
+            self._fit_best_to(fold.train, rollouts).model for fold, rollouts in folds
+        ]
+        held_out = [fold.held_out for fold, _ in folds]
+        return fit_noise(models, held_out, self._steps)
+
+    def _quarters(self) -> list[tuple[Fold, "_Rollouts | None"]]:
+        """Halves what each fold holds out, every other run or block of it.
+
+        With them come the rollouts that a correction may be fitted to.
+
+        Raises:
+            DataError: One would be without windows.
+        """
+        rollouts: list[_Rollouts] = []
+        if self.best.penalties:
+            rollouts = self._held_out_rollouts(replace(self.best, penalties=()))
+        quarters = []
+        for i, fold in enumerate(self._folds):
+            runs = fold.held_out.runs
+            for first in range(2):
+                quarter = Fold(
+                    train=replace(
+                        fold.train, runs=(*fold.train.runs, *runs[1 - first :: 2])
+                    ),
+                    held_out=replace(fold.held_out, runs=runs[first::2]),
+                )
+                quarter.held_out.windows(self._steps, past=PAST_ROWS, most=1)
+                others = None
+                if rollouts:
+                    own = rollouts[i]
+                    is_other = own.windows.runs % 2 != first
+                    others = _concatenated([own[is_other], rollouts[1 - i]])
+                quarters.append((quarter, others))
+        return quarters
 
     def fit_to_all_runs(self) -> NominalFit:
         """Fits the best structure to all runs, its GPs and its correction as well."""
+        rollouts = None
+        if self.best.penalties:
+            uncorrected = replace(self.best, penalties=())
+            rollouts = _concatenated(self._held_out_rollouts(uncorrected))
+        return self._fit_best_to(self._log, rollouts)
+
+    def _fit_best_to(self, log: Log, rollouts: "_Rollouts | None") -> NominalFit:
+        """Fits the best structure to a log.
+
+        Args:
+            log: The rows.
+            rollouts: That a correction is fitted to; None where it has none.
+        """
         best = self.best
-        training = _TrainingData(self._log, None)
+        training = _TrainingData(log, None)
         if best.model.memory.empty:
-            training = self._training_data(self._log)
+            training = self._training_data(log)
         fit = self._fit_nominal_to(training.log, best.nominal)
         gps = tuple(self._train(gp, fit.model, training.log) for gp in best.gps)
         model = replace(fit.model, gps=gps, start_filter=training.start_filter)
-        if best.penalties:
-            uncorrected = replace(best, penalties=())
-            rollouts = _concatenated(self._held_out_rollouts(uncorrected))
+        if rollouts is not None:
             correction = self._chosen_correction(best, rollouts)
             model = replace(model, correction=correction)
         return replace(fit, model=model)

@@ -1,0 +1,245 @@
+"""What wins is what is written: folds, combinations, smoothing, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gpmpc.gp import train
+from gpmpc.logs import Log, LogMapping, judge, learn
+from gpmpc.logs._comparison import compare
+from gpmpc.logs._control_fitness import judge_for_control
+from gpmpc.logs._folds import split_folds
+from gpmpc.logs._log import LogRun
+from gpmpc.logs._smoothing import smooth
+from gpmpc.models import LogModel
+from gpmpc.models._correction import Correction
+from gpmpc.models._kinematics import Increments
+from gpmpc.models._parametric import AffineNominal
+
+TWO = LogMapping.from_dict({"states": {"c": ["c"], "T": ["T"]}, "inputs": {"u": ["u"]}})
+STEP = 0.1
+
+
+def log_of(states, inputs, mapping=TWO, step=STEP):
+    """A log of runs (R, K, n), (R, K, m)."""
+    runs = tuple(
+        LogRun(
+            f"run {i}",
+            step * np.arange(len(x)),
+            np.asarray(x),
+            np.asarray(u),
+            np.empty((len(x), 0)),
+        )
+        for i, (x, u) in enumerate(zip(states, inputs, strict=True))
+    )
+    return Log(mapping, step, runs)
+
+
+def simulate(rates, start, inputs, step=STEP):
+    """Euler steps of a system."""
+    states = [np.array(start, dtype=float)]
+    for u in inputs[:-1]:
+        states.append(states[-1] + step * np.array(rates(states[-1], u)))
+    return np.array(states)
+
+
+def held_inputs(rng, rows, width, hold=8):
+    return np.repeat(rng.uniform(-width, width, (rows // hold + 1, 1)), hold, axis=0)[
+        :rows
+    ]
+
+
+def reactor_log(rows=500):
+    """Concentration and temperature, each of which burns by a product of both."""
+
+    def rates(x, u):
+        burned = x[0] * np.exp(1.5 * x[1])
+        return [0.5 * (1 - x[0]) - 0.4 * burned, 0.4 * burned - 0.9 * x[1] + u[0]]
+
+    inputs = held_inputs(np.random.default_rng(0), rows, 0.5)
+    return log_of([simulate(rates, [0.6, 0.2], inputs)], [inputs])
+
+
+def test_a_transient_and_its_rest_are_in_both_folds():
+    time = np.arange(600)
+    states = np.column_stack([3 * np.exp(-time / 40), np.exp(-time / 40)])
+    folds = split_folds(log_of([states], [np.zeros((600, 1))]), past=23, steps=10)
+    assert folds.coverage > 0.8
+    for fold in folds.pair:
+        assert max(run.states[:, 0].max() for run in fold.train) > 1.0
+        rows_of = [
+            {tuple(row) for run in part for row in run.states}
+            for part in (fold.train, fold.held_out)
+        ]
+        assert not rows_of[0] & rows_of[1]
+    first, second = (fold.held_out for fold in folds.pair)
+    assert len(first) + len(second) == 600
+    halves = split_folds(log_of([states[:90]], [np.zeros((90, 1))]), past=23, steps=10)
+    assert "halves" in halves.words
+
+
+def test_runs_are_dealt_so_that_ranges_are_covered():
+    rng = np.random.default_rng(0)
+    sizes = [1, 1, 3, 3, 1, 3]
+    states = [size * rng.uniform(-1, 1, (200, 2)) for size in sizes]
+    log = log_of(states, [rng.uniform(-1, 1, (200, 1))] * 6)
+    folds = split_folds(log, past=23, steps=10)
+    assert "6 runs" in folds.words
+    for fold in folds.pair:
+        wide = [size for run in fold.train for size in [np.abs(run.states).max()]]
+        assert max(wide) > 2
+
+
+def test_coupled_outputs_are_learned_together():
+    """As well as by plain ``train``, though a GP on either output alone is worse."""
+    fitting, held_out = reactor_log().split_by_time(0.8)
+    learned = learn(fitting, points=60, steps=20)
+    judgement = judge(learned, held_out, fitting, steps=(1, 20))
+    assert not judgement.losses
+    posterior = train(fitting.transitions(), predicts="difference").posterior
+    windows = held_out.windows(20, 20)
+    x = windows.states[:, 20]
+    for k in range(20):
+        x = x + posterior.linearize(x, windows.inputs[:, 20 + k], False).mean
+    plain = np.abs(x - windows.states[:, 40]).mean(axis=0)
+    assert (judgement.mean["model"][-1] < 2 * plain + 1e-3 * x.std(axis=0)).all()
+    best = next(one for one in learned.candidates if one.chosen)
+    linear = [one for one in learned.candidates if one.name == "least squares"]
+    assert (best.errors[-1] < 0.3 * linear[0].errors[-1]).all()
+
+
+def test_smoothing_takes_noise_away_and_leaves_clean_rows():
+    rng = np.random.default_rng(0)
+    inputs = held_inputs(rng, 1500, 2.0)
+    clean = simulate(lambda x, u: [x[1], -4 * x[0] - x[1] + u[0]], [0, 0], inputs, 0.02)
+    kinematics = Increments(TWO.space)
+    assert smooth(log_of([clean], [inputs], step=0.02), kinematics, 0) is None
+    noisy = clean + rng.normal(0, [0.02, 0.05], clean.shape)
+    smoothed = smooth(log_of([noisy], [inputs], step=0.02), kinematics, 0)
+    assert smoothed is not None
+    errors = np.sqrt(np.square(smoothed.runs[0].states - clean).mean(axis=0))
+    assert (errors < 0.4 * np.array([0.02, 0.05])).all()
+    # Steps that are random themselves are no noise of the measurement.
+    walk = np.cumsum(rng.normal(size=(1500, 2)), axis=0)
+    assert smooth(log_of([walk], [inputs]), kinematics, 0) is None
+
+
+def test_noisy_rows_lose_to_no_baseline():
+    rng = np.random.default_rng(1)
+    inputs = held_inputs(rng, 2000, 2.0)
+    clean = simulate(
+        lambda x, u: [x[1], -6 * np.sin(x[0]) - 0.4 * x[1] + u[0]], [0, 0], inputs, 0.02
+    )
+    noisy = clean + rng.normal(0, [0.02, 0.05], clean.shape)
+    log = log_of([noisy], [inputs], step=0.02)
+    fitting, held_out = log.split_by_time(0.8)
+    learned = learn(fitting, points=40, steps=20)
+    judgement = judge(learned, held_out, fitting, steps=(1, 10, 20))
+    assert not judgement.losses
+    baselines = [e for name, e in judgement.mean.items() if name != "model"]
+    ratio = judgement.mean["model"] / np.min(baselines, axis=0)
+    assert ratio.max() < 1.03
+    assert ratio[-1].max() < 0.9
+
+
+def test_a_correction_upon_a_still_state_is_a_regression():
+    log = reactor_log(400)
+    kinematics = Increments(log.space)
+    windows = log.windows(10, past=20)
+    still = np.repeat(windows.states[:, 20:21], 10, axis=1)
+    correction = Correction.fit(
+        kinematics, windows, still, (1, 10), np.full((2, 2), 1e-6)
+    )
+    corrected = correction(windows, still)
+    free = Correction.fit(kinematics, windows, still, (10,), np.full((1, 2), np.inf))
+    np.testing.assert_array_equal(free(windows, still)[:, -1], still[:, -1])
+    error = [
+        np.square(windows.states[:, 30] - states[:, -1]).mean()
+        for states in (corrected, still)
+    ]
+    assert error[0] < 0.2 * error[1]
+    between = correction(windows, still)[:, 4] - still[:, 4]  # 5 of 1 to 10 steps
+    ends = correction(windows, still) - still
+    expected = ends[:, 0] + (ends[:, 9] - ends[:, 0]) * 4 / 9
+    np.testing.assert_allclose(between, expected, atol=1e-12)
+
+
+def test_intervals_of_a_comparison_hold():
+    hits = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        distances = rng.exponential(1.0, (400, 1, 1))
+        others = rng.exponential(2.0, (400, 1, 1))
+        one = compare("other", distances, others, block=5, seed=seed)
+        hits += bool(one.low < 0.5 < one.high)
+        assert one.high - one.low < 0.25
+    assert hits >= 33  # of 38 expected, with a standard error of 1.4
+    again = compare("other", distances, others, block=5, seed=39)
+    np.testing.assert_array_equal(one.low, again.low)
+
+
+def test_a_model_that_no_controller_should_use_is_named():
+    rng = np.random.default_rng(0)
+
+    def rates(x, u):
+        return [x[1], -x[0] - 0.5 * x[1] + 2 * u[0]]
+
+    def fitness(inputs, states):
+        log = log_of([states], [inputs])
+        model = LogModel(
+            Increments(log.space), AffineNominal(Increments(log.space)), THETA, (0, 0)
+        )
+        return judge_for_control(model, log, {})
+
+    inputs = held_inputs(rng, 600, 1.0)
+    states = simulate(rates, [0.1, 0], inputs)
+    good = fitness(inputs, states)
+    assert not good.faults
+    assert not good.warnings
+    assert not good.advice
+    assert (good.effects[0].output, round(good.effects[0].gain, 3)) == ("d_T", 2.0)
+    constant = fitness(np.full((600, 1), 0.3), simulate(rates, [1, 0], [[0.3]] * 600))
+    assert "does not move" in constant.faults[0]
+    assert "noise.input=[0.03]" in constant.advice[0]
+    gain = np.array([-0.5, -0.7])
+    closed = simulate(lambda x, u: rates(x, [x @ gain]), [1, 0], inputs)
+    followed = fitness(closed @ gain[:, None], closed)
+    assert "follows the states" in followed.faults[0]
+
+
+# of [c, T, u, 1] for each rate of change
+THETA = np.array([0, 1, 0, 0, -1, -0.5, 2, 0], dtype=float)
+
+
+def test_a_feedback_that_fails_on_a_rival_is_told():
+    rng = np.random.default_rng(0)
+    inputs = held_inputs(rng, 600, 1.0)
+
+    def rates(x, u):
+        return [x[1], -0.5 * x[1] + 2 * u[0]]
+
+    log = log_of([simulate(rates, [0.1, 0], inputs)], [inputs])
+    theta = np.array([0, 1, 0, 0, 0, -0.5, 2, 0], dtype=float)
+    model = LogModel(
+        Increments(log.space), AffineNominal(Increments(log.space)), theta, (0, 0)
+    )
+    opposite = replace(model, theta=np.array([0, 1, 0, 0, 0, -0.5, -2, 0], dtype=float))
+    fitness = judge_for_control(model, log, {"itself": model, "opposite": opposite})
+    (warning,) = fitness.warnings
+    assert "'opposite' unstable" in warning
+
+
+@pytest.mark.parametrize("control", [False, True])
+def test_the_same_seed_gives_the_same_numbers(control):
+    log = reactor_log(300)
+    memory = {}
+    first = learn(log, points=20, steps=10, for_control=control, memory=memory)
+    again = learn(log, points=20, steps=10, for_control=control, memory=dict(memory))
+    for one, other in zip(first.candidates, again.candidates, strict=True):
+        np.testing.assert_array_equal(one.errors, other.errors)
+    windows = log.windows(10, 20)
+    np.testing.assert_array_equal(
+        first.model.rollout(windows), again.model.rollout(windows)
+    )
+    assert (first.control is not None) == control
