@@ -91,6 +91,7 @@ def _texts(controller: GPMPC, numbers: Numbers, on_failure: str) -> tuple[str, s
             "#include <float.h>",
             "#include <math.h>",
             "#include <stdint.h>",
+            "#include <stdlib.h>",
             "#include <string.h>",
             "",
             _part("numbers.h"),

@@ -215,7 +215,7 @@ static void guess_plan(gpmpc_controller *controller, const real *state,
                                       GPMPC_STATE_ANGLE_COUNT);
             else
                 mean = problem->targets[k][i]
-                       + (1 - k * ((real)1 / H)) * (state[i] - problem->targets[1][i]);
+                       + (1 - (real)k * ((real)1 / H)) * (state[i] - problem->targets[1][i]);
             problem->states[k][i] = mean;
         }
     for (k = 0; k < H; k++)
@@ -412,23 +412,25 @@ static void predict_covariances(gpmpc_problem *problem, const real *start)
    The rows of the states' constraints.
    --------------------------------------------------------------------------------- */
 
-/* Gradients of row e at stage k by s_{k+1} and by u_k; NULL for zero. */
+/* Gradient of row e at stage k by s_{k+1}; that by u_k is zero where none is smooth. */
 #if GPMPC_SMOOTH
 #define ROW_BY_STATE(problem, k, e) ((problem)->E[k][e])
-#define ROW_BY_INPUT(problem, k, e) ((problem)->D[k][e])
 #else
 #define ROW_BY_STATE(problem, k, e) ((void)(k), row_gradients + (e) * n)
-#define ROW_BY_INPUT(problem, k, e) ((const real *)0)
 #endif
 
 /* E s_{k+1} + D u_k */
 static real row_value(const gpmpc_problem *problem, int k, int e, const real *s,
                       const real *u)
 {
-    const real *by_input = ROW_BY_INPUT(problem, k, e);
     real value = dot(ROW_BY_STATE(problem, k, e), s, n);
+#if GPMPC_SMOOTH
+    value += dot(problem->D[k][e], u, m);
+#else
     (void)problem;
-    return by_input ? value + dot(by_input, u, m) : value;
+    (void)u;
+#endif
+    return value;
 }
 
 /* Writes the rows at the plan: smooth ones linearised, bounds moved inwards by
@@ -519,10 +521,10 @@ static int keeps_hard_rows(const gpmpc_problem *problem)
         for (e = 0; e < r; e++) {
             real value =
                 row_value(problem, k, e, problem->states[k + 1], problem->inputs[k]);
-            real outside = larger(value - problem->row_upper[k][e],
-                                  problem->row_lower[k][e] - value);
-            if (row_prices[e] > LARGEST && outside > 0)
-                total += outside;
+            real missed = larger(value - problem->row_upper[k][e],
+                                 problem->row_lower[k][e] - value);
+            if (row_prices[e] > LARGEST && missed > 0)
+                total += missed;
         }
     return total <= FEASIBLE;
 }
@@ -617,13 +619,13 @@ static void add_states(gpmpc_problem *problem, gpmpc_program *program)
                            program->P[before + i], width);
         for (e = 0; e < r; e++) {
             real *row = program->G[GPMPC_RATE_ROWS + k * r + e];
-            const real *by_input = ROW_BY_INPUT(problem, k, e);
             fill(row, 0, N);
             for (j = 0; j < n; j++)
                 add_scaled(ROW_BY_STATE(problem, k, e)[j], problem->gamma[now][j], row,
                            width);
-            if (by_input)
-                add_scaled(1, by_input, row + before, m);
+#if GPMPC_SMOOTH
+            add_scaled(1, problem->D[k][e], row + before, m);
+#endif
         }
     }
     for (i = 0; i < N; i++)
@@ -725,17 +727,18 @@ static void write_gradient(gpmpc_controller *controller)
 static void write_augmented(const gpmpc_problem *problem, int k, int size, real *A,
                             real *B)
 {
+    const real no_target[GPMPC_STATES] = {0};
+    const real *origin = k == 0 ? no_target : problem->targets[k]; /* s_0 has none */
     int stage = stage_of(k);
     int e = size - 1;
-    int i, j;
+    int i;
     fill(A, 0, size * size);
     fill(B, 0, size * m);
     for (i = 0; i < n; i++) {
         real shift = problem->c[stage][i] - problem->targets[k + 1][i];
         copy(problem->A[stage][i], A + i * size, n);
         copy(problem->B[stage][i], B + i * m, m);
-        if (k > 0)
-            shift += dot(problem->A[stage][i], problem->targets[k], n);
+        shift += dot(problem->A[stage][i], origin, n);
         if (GPMPC_PENALIZED == DEVIATIONS)
             shift += dot(problem->B[stage][i], problem->target_inputs[k], m);
         A[i * size + e] = shift;
@@ -748,8 +751,7 @@ static void write_augmented(const gpmpc_problem *problem, int k, int size, real 
     A[e * size + e] = 1;
     if (GPMPC_PENALIZED == INCREMENTS)
         for (i = 0; i < size; i++)
-            for (j = 0; j < m; j++)
-                A[i * size + n + j] += B[i * m + j];
+            add_scaled(1, B + i * m, A + i * size + n, m);
 }
 
 /* Writes the weight W (size, size) of the augmented state after stage k. */
@@ -858,13 +860,13 @@ static void condense_with_feedback(gpmpc_controller *controller)
                 add_scaled(problem->B[stage_of(k)][i][j], next[n + j], next[i], width);
         }
         for (e = 0; e < r; e++) {
-            const real *by_input = ROW_BY_INPUT(problem, k, e);
             fill(row, 0, width);
             for (j = 0; j < n; j++)
                 add_scaled(ROW_BY_STATE(problem, k, e)[j], next[j], row, width);
-            if (by_input)
-                for (j = 0; j < m; j++)
-                    add_scaled(by_input[j], next[n + j], row, width);
+#if GPMPC_SMOOTH
+            for (j = 0; j < m; j++)
+                add_scaled(problem->D[k][e][j], next[n + j], row, width);
+#endif
             copy(row, program->G[N + GPMPC_RATE_ROWS + k * r + e], width);
         }
         now = 1 - now;
@@ -906,7 +908,7 @@ static void condense(gpmpc_controller *controller)
     gpmpc_problem *problem = &controller->problem;
     gpmpc_program *program = &controller->program;
     real growth = 0;
-    int i;
+    int i, k;
     problem->has_feedback = 0;
     program->rows = GPMPC_RATE_ROWS + GPMPC_STATE_ROWS;
     write_input_hessian(program);
@@ -918,10 +920,12 @@ static void condense(gpmpc_controller *controller)
     }
     write_costs_to_go(problem, program);
     add_states(problem, program);
-    for (i = 0; i < N; i++) {
-        int last = (H - 1) * m + i % m;
-        growth += program->P[i][i] / program->P[last][last];
-    }
+    for (k = 0; k < H; k++)
+        for (i = 0; i < m; i++) {
+            int here = k * m + i;
+            int last = N - m + i;
+            growth += program->P[here][here] / program->P[last][last];
+        }
 #if GPMPC_FEEDBACK_COORDINATES
     if (!(growth <= LARGEST_GROWTH)) {
         condense_with_feedback(controller);
@@ -1003,7 +1007,7 @@ static real elastic_price(const gpmpc_problem *problem, const real *states,
 {
     real free_cost = cost_of_plan(problem, states, inputs);
     real cost = smaller(larger(free_cost, last_cost), 2 * free_cost);
-    real missed = 0;
+    real sum_missed = 0;
     real beside = 0;
     int k, e, i;
     for (k = 0; k < H; k++)
@@ -1011,19 +1015,19 @@ static real elastic_price(const gpmpc_problem *problem, const real *states,
             const real *g = ROW_BY_STATE(problem, k, e);
             const real *Q = state_weights + (GPMPC_STATE_WEIGHTS > 1 ? k : 0) * n * n;
             real value = row_value(problem, k, e, states + (k + 1) * n, inputs + k * m);
-            real outside = larger(value - problem->row_upper[k][e],
+            real missed = larger(value - problem->row_upper[k][e],
                                   problem->row_lower[k][e] - value);
             real weight = 0;
             real square;
-            if (!row_is_elastic[e] || !(outside > 0))
+            if (!row_is_elastic[e] || !(missed > 0))
                 continue;
             for (i = 0; i < n; i++)
                 weight += g[i] * dot(Q + i * n, g, n);
             square = larger(dot(g, g, n), REAL(1e-12));
-            missed += outside;
-            beside += weight / (square * square) * outside * outside;
+            sum_missed += missed;
+            beside += weight / (square * square) * missed * missed;
         }
-    return 2 * (cost + beside) / larger(missed, REAL(1e-12));
+    return 2 * (cost + beside) / larger(sum_missed, REAL(1e-12));
 }
 
 /* Solves the program once more with another price of the elastic rows, where the first

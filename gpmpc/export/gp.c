@@ -3,9 +3,9 @@
 typedef double wide;
 
 /* The exponential without branch and table (Cody and Waite, 1980): x = j ln 2 + y with
-   |y| <= ln(2) / 2, exp(x) = 2^j exp(y), exp(y) = 1 + y + y^2 g(y). Adding ``shift``
+   |y| <= ln(2) / 2, exp(x) = 2^j exp(y), exp(y) = 1 + y + y^2 g(y). Adding ``SHIFT``
    leaves j in the lowest bits, biased as an exponent is; there 2^j is made of it. */
-static const wide shift = 6755399441056767.0; /* 1.5 * 2^52 + 1023 */
+static const wide SHIFT = 6755399441056767.0; /* 1.5 * 2^52 + 1023 */
 
 static wide power_of_two(wide shifted)
 {
@@ -22,7 +22,7 @@ static wide exponential(wide x)
     wide j, y, g, half;
     x = x < -750.0 ? -750.0 : x;
     x = x > 720.0 ? 720.0 : x;
-    j = (x * 1.4426950408889634 + shift) - shift;
+    j = (x * 1.4426950408889634 + SHIFT) - SHIFT;
     y = (x - j * 0.6931471805599453) - j * 2.3190468138462996e-17;
     g = y * 2.510038319586702e-08 + 2.7620085455018414e-07;
     g = g * y + 2.7557268464831627e-06;
@@ -35,8 +35,8 @@ static wide exponential(wide x)
     g = g * y + 0.5000000000000001;
     g = (g * (y * y) + y) + 1.0;
     /* 2^j in two halves, down to the subnormal numbers */
-    half = j * 0.5 + shift;
-    return g * power_of_two(half) * power_of_two((j - (half - shift)) + shift);
+    half = j * 0.5 + SHIFT;
+    return g * power_of_two(half) * power_of_two((j - (half - SHIFT)) + SHIFT);
 }
 
 /* Returns start + sum x_i, in eight interleaved parts as registers of eight numbers take
@@ -116,7 +116,6 @@ static void gp_evaluate(const gp_tables *gp, const real *query, wide *memory,
         for (i = 0; i < count; i++)
             differences[j * count + i] = gp->x[j * count + i] - query[j];
     for (a = 0; a < gp->outputs; a++) {
-        wide value;
         const wide *scales = gp->scales + a * d;
         const wide *weights = gp->weights + a * count;
         for (i = 0; i < count; i++)
@@ -137,8 +136,8 @@ static void gp_evaluate(const gp_tables *gp, const real *query, wide *memory,
                 (real)(scales[j] * wide_dot(weighted, differences + j * count, count));
         if (variance && gp->cholesky) {
             const wide *L = gp->cholesky + a * (count * (count + 1) / 2);
-            value = exponential(gp->log_signal[a])
-                    - variance_reduction(L, kernel, count);
+            wide value = exponential(gp->log_signal[a])
+                         - variance_reduction(L, kernel, count);
             variance[a] = value > 0 ? (real)value : 0;
         }
     }

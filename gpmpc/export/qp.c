@@ -18,10 +18,12 @@ static int iteration_limit(const gpmpc_program *work)
 
 static int constraint_count(const gpmpc_program *work) { return N + work->rows; }
 
+/* Constraint p of a label p + 1 (at its upper bound) or -(p + 1) (at its lower one). */
+static int constraint_of(int label) { return abs(label) - 1; }
+
 static int constraint_in(const gpmpc_program *work, int slot)
 {
-    int label = work->label[slot];
-    return (label < 0 ? -label : label) - 1;
+    return constraint_of(work->label[slot]);
 }
 
 /* a <- L^-1 a, L (k, k) in rows of ``stride`` with reciprocals on its diagonal */
@@ -159,18 +161,17 @@ static int is_watched(const gpmpc_program *work, int p)
     return work->allowed_low[p] > -LARGEST || work->allowed_high[p] < LARGEST;
 }
 
-/* The value of constraint p at the present x. */
-static void write_value(gpmpc_program *work, int p)
+/* The value of a row of G at the present x. */
+static void write_value(gpmpc_program *work, int row)
 {
-    if (p >= N)
-        work->value[p] = dot(work->G[p - N], work->value, work->row_end[p]);
+    work->value[N + row] = dot(work->G[row], work->value, work->row_end[N + row]);
 }
 
 static void multiply_constraints(gpmpc_program *work)
 {
-    int p;
-    for (p = N; p < constraint_count(work); p++)
-        write_value(work, p);
+    int row;
+    for (row = 0; row < work->rows; row++)
+        write_value(work, row);
 }
 
 static real outside(const gpmpc_program *work, int p)
@@ -201,7 +202,8 @@ static int recheck_violated(gpmpc_program *work, real margin, int count)
     int i;
     for (i = 0; i < count; i++) {
         int p = work->violated[i];
-        write_value(work, p);
+        if (p >= N)
+            write_value(work, p - N);
         work->excess[p] = outside(work, p) / work->norm[p] - margin;
         if (work->excess[p] > 0)
             work->violated[remaining++] = p;
@@ -247,7 +249,7 @@ static int choose_guessed(gpmpc_program *work, const gpmpc_solution *guess)
     int i;
     for (i = 0; i < guess->working; i++) {
         int label = guess->label[i];
-        int p = (label < 0 ? -label : label) - 1;
+        int p = constraint_of(label);
         real bound;
         if (p < 0 || p >= constraint_count(work))
             continue;
@@ -321,7 +323,7 @@ static int add_candidates(gpmpc_program *work, int k, int count)
     int i;
     for (i = 0; i < count; i++) {
         int label = work->candidates[i];
-        int p = (label < 0 ? -label : label) - 1;
+        int p = constraint_of(label);
         real pivot;
         if (!is_watched(work, p) || k >= N)
             continue;
@@ -579,6 +581,14 @@ static void clip_multiplier(gpmpc_program *work, int slot, real value)
                 work->most_multiplier[slot]);
 }
 
+/* Puts the working multipliers into their ranges, which rounding can leave. */
+static void clip_multipliers(gpmpc_program *work, int k)
+{
+    int i;
+    for (i = 0; i < k; i++)
+        clip_multiplier(work, i, work->multiplier[constraint_in(work, i)]);
+}
+
 /* The state of the iteration, from round to round. */
 typedef struct {
     int status;
@@ -598,7 +608,6 @@ static void iterate(gpmpc_program *work, Progress *progress, int starts, int gue
     int k = progress->size;
     int limit = iteration_limit(work);
     int violated = 0;
-    int i;
     progress->status = GPMPC_SOLVED;
     while (starts || count > 0) {
         int size_before = k;
@@ -663,8 +672,7 @@ static void iterate(gpmpc_program *work, Progress *progress, int starts, int gue
         starts = 0;
     }
     if (progress->status == GPMPC_SOLVED && violated)
-        for (i = 0; i < k; i++)
-            clip_multiplier(work, i, work->multiplier[constraint_in(work, i)]);
+        clip_multipliers(work, k);
     progress->size = k;
     progress->violated = violated;
 }
@@ -676,13 +684,14 @@ static real relative_residual(const gpmpc_program *work, int slot, real residual
     int p = constraint_in(work, slot);
     real scaled_length = length * work->norm[p];
     real terms;
-    int j;
     if (!(residual > FINEST * scaled_length))
         return 0;
     terms = larger(absolute(work->bound[slot]), REAL(1e-6) * scaled_length);
-    if (p >= N && residual > ROW_RESIDUAL * terms)
+    if (p >= N && residual > ROW_RESIDUAL * terms) {
+        int j;
         for (j = 0; j < work->row_end[p]; j++)
             terms = larger(terms, absolute(work->G[p - N][j] * work->value[j]));
+    }
     return larger(residual / scaled_length, residual / (100 * terms));
 }
 
@@ -916,15 +925,16 @@ static int open_program(gpmpc_program *work, const real *prices)
    y'C = 0, up to rounding, sum y+ upper + y- lower < 0. */
 static int proves_infeasibility(gpmpc_program *work, const real *ray)
 {
-    real sum = 0;
+    real total = 0;
     real sizes = 0;
-    int p, i;
+    int p;
     for (p = 0; p < constraint_count(work); p++) {
         real repaired = ray[p];
         real bound;
         if (p < N) {
             real rest = ray[p];
             real rounding = absolute(ray[p]);
+            int i;
             for (i = 0; i < work->rows; i++) {
                 rest += ray[N + i] * work->G[i][p];
                 rounding += absolute(ray[N + i] * work->G[i][p]);
@@ -937,10 +947,10 @@ static int proves_infeasibility(gpmpc_program *work, const real *ray)
         bound = repaired > 0 ? work->upper[p] : work->lower[p];
         if (!is_finite(repaired * bound))
             return 0;
-        sum += repaired * bound;
+        total += repaired * bound;
         sizes += absolute(repaired * bound);
     }
-    return sum < -ROUNDING_OF_SUMS * sizes;
+    return total < -ROUNDING_OF_SUMS * sizes;
 }
 
 static int is_certain(gpmpc_program *work, const gpmpc_solution *solution)
