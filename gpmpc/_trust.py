@@ -40,6 +40,7 @@ MODEL_CODE = frozenset(
 
 _SETTINGS = {
     "gpmpc.datasets": "ExcitedData Excitation NMPCData PaperData RandomData Tracking",
+    "gpmpc.export": "compiled_controller",
     "gpmpc.gp": "SlidingWindow SoftLimits SparseTrainer Trainer centre identity "
     "min_max standardize",
     "gpmpc.learning": "EpisodicLearning OnlineLearning",

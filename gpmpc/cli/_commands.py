@@ -238,6 +238,27 @@ COMMANDS = {
             _TRUST,
         ],
     ),
+    "export": Subcommand(
+        "Writes the controller of a recorded run as C",
+        module="_export",
+        arguments=[
+            _argument("language", choices=["c"], help="c: C99, for any compiler"),
+            _argument(
+                "run",
+                type=Path,
+                metavar="RUN",
+                help="a run's folder or recording; its model is learned again",
+            ),
+            _folder("where the code goes (RUN/c)"),
+            _argument(
+                "--precision",
+                choices=["double", "float"],
+                default="double",
+                help="of all numbers (double)",
+            ),
+            _TRUST,
+        ],
+    ),
     "learn": Subcommand(
         "Learns a model from logs and judges it on held-out runs",
         module="_learn",

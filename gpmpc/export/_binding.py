@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from gpmpc.exceptions import SettingError
-from gpmpc.export._write import Precision, export_c
+from gpmpc.export._write import Precision, write_code
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import GPMPC, Decision, PredictionSettings, Problem, Reference, Timing
 from gpmpc.mpc._controller import read_reference
@@ -64,7 +64,7 @@ class CompiledLibrary:
         self.number = ctypes.c_double if precision == "double" else ctypes.c_float
         self.dtype = np.dtype(self.number)
         with tempfile.TemporaryDirectory() as folder:
-            export = export_c(controller, folder, precision, on_failure)
+            export = write_code(controller, Path(folder), precision, on_failure)
             library = Path(folder) / "gpmpc.so"
             command = [*compiler, "-std=c99", "-shared", "-fPIC"]
             _compile([*command, "-o", str(library), str(export.source), "-lm"])
@@ -211,6 +211,8 @@ class CompiledLoop:
     Attributes:
         status: Of the last step.
         failed: Whether its input was chosen by the policy.
+        seconds: That the last step took [s].
+        memory_bytes: Of the controller.
     """
 
     def __init__(
@@ -223,8 +225,10 @@ class CompiledLoop:
         self._controller = controller
         self._library = CompiledLibrary(controller, precision, on_failure, compiler)
         self._memory = self._library.new_memory()
+        self.memory_bytes = len(self._memory)
         self.status = Status.SOLVED
         self.failed = False
+        self.seconds = 0.0
 
     def input(self, state: Any, reference: Any) -> Array:
         """Returns the input to apply now (m,); see ``ControlLoop.input``."""
@@ -236,7 +240,9 @@ class CompiledLoop:
             read_reference(reference), controller.horizon
         )
         m = len(controller.initial_input)
+        began = perf_counter()
         input = self._library.step(self._memory, belief, followed, m)
+        self.seconds = perf_counter() - began
         kept = self._library.kept(self._memory)
         self.status = _STATUSES[kept.status]
         self.failed = bool(kept.failed)

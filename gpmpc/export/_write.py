@@ -15,6 +15,18 @@ from gpmpc.mpc import GPMPC
 _HERE = Path(__file__).parent
 
 
+# what stands around the code, by its place in the folder
+_AROUND = {
+    "Makefile": "Makefile",
+    "CMakeLists.txt": "CMakeLists.txt",
+    "library.properties": "library.properties",
+    "examples/replay/replay.c": "replay.c",
+    "ros2/node.cpp": "ros2_node.cpp",
+    "ros2/CMakeLists.txt": "ros2_CMakeLists.txt",
+    "ros2/package.xml": "ros2_package.xml",
+}
+
+
 class Export(NamedTuple):
     """The files of an exported controller."""
 
@@ -28,26 +40,39 @@ def export_c(
     precision: Precision = "double",
     on_failure: str = "previous_plan",
 ) -> Export:
-    """Writes a controller as ``gpmpc.h`` and ``gpmpc.c`` into a folder.
+    """Writes a controller as C into a folder.
 
-    The code is C99, needs nothing but libm, and decides as ``ControlLoop`` does around
-    the controller, to the rounding of ``precision``.
+    The code, ``src/gpmpc.h`` and ``src/gpmpc.c``, is C99, needs nothing but libm, and
+    decides as ``ControlLoop`` does around the controller, to the rounding of
+    ``precision``. Around it stand a Makefile, CMakeLists.txt, the layout of an Arduino
+    library, an example that replays a flight (``write_replay``), and a ROS 2 node.
 
     Args:
         controller: A ``GPMPC`` of one program a step.
         path: The folder, which is made where it does not exist.
-        precision: Of all numbers, ``"double"`` or ``"float"``.
+        precision: Of all numbers, ``"double"`` or ``"float"``; the sums of GPs are
+            taken in double in both.
         on_failure: What is applied where a step fails: ``"previous_plan"`` or
             ``"hold"``; see ``ControlLoop``.
 
     Raises:
         SettingError: The controller has a part that C cannot hold; it is named.
     """
+    folder = Path(path)
+    export = write_code(controller, folder / "src", precision, on_failure)
+    for place, name in _AROUND.items():
+        (folder / place).parent.mkdir(parents=True, exist_ok=True)
+        write_whole(folder / place, (_HERE / "around" / name).read_text())
+    return export
+
+
+def write_code(
+    controller: GPMPC, folder: Path, precision: Precision, on_failure: str
+) -> Export:
+    """Writes header and source alone; see ``export_c``."""
     check_choice("precision", precision, ("double", "float"))
     check_exportable(controller, on_failure)
-    numbers = Numbers(precision)
-    folder = Path(path)
-    header, source = _texts(controller, numbers, on_failure)
+    header, source = _texts(controller, Numbers(precision), on_failure)
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / "gpmpc.h", header)
     write_whole(folder / "gpmpc.c", source)

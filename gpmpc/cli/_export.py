@@ -1,0 +1,121 @@
+"""``gpmpc export c``: writes the controller of a recorded run as C.
+
+    run -> its experiment -> its model, learned again -> the controller -> C, replay
+
+A model that was trained before the run is taken as it is.
+"""
+
+import argparse
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from gpmpc.cli._commands import Result
+from gpmpc.cli._recorded import errors_of_settings, experiment_of_run, recordings
+from gpmpc.cli._settings import writing
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.export import CompiledLoop, Question, export_c, write_replay
+from gpmpc.mpc import GPMPC, ControlLoop, Reference
+from gpmpc.recording import Run, read_run
+from gpmpc.studies.flight import Experiment
+from gpmpc.studies.study import one_thread
+
+
+def export(arguments: argparse.Namespace) -> Result:
+    """Writes a controller as C, and replays its flight by it."""
+    console = Console()
+    path = _only_recording(arguments.run)
+    run = read_run(path)
+    experiment = experiment_of_run(run, arguments.trust)
+    folder = arguments.to or path.parent / "c"
+    with console.status("learning"):
+        controller = _controller_of(run, experiment)
+    policy: Any = experiment.on_failure
+    with writing(folder, "to"):
+        export_c(controller, folder, arguments.precision, policy)
+        questions = list(_questions(run, experiment, controller))
+        steps = write_replay(controller, questions, folder / "replay.txt", policy)
+    lines = [f"written to {folder}: src/gpmpc.h, src/gpmpc.c, and a replay of {steps}"]
+    data: dict[str, Any] = {"folder": str(folder), "steps": steps}
+    if shutil.which("cc"):
+        with console.status("compiling"):
+            data |= _measure(controller, questions, arguments.precision, policy)
+        lines += [
+            f"memory            {data['memory_bytes'] / 1024:.0f} kB of one controller",
+            f"a step, here      median {data['median_us']:.0f} us, "
+            f"longest {data['longest_us']:.0f} us",
+            f"beside Python     inputs within {data['largest_difference']:.2g}, "
+            f"{data['other_statuses']} other statuses",
+        ]
+    else:
+        lines.append("not compiled: there is no cc on this machine")
+    console.out(*lines, sep="\n", highlight=False)
+    return Result(data)
+
+
+def _only_recording(path: Path) -> Path:
+    """Returns the recording of a run, which must be one."""
+    paths = recordings(path)
+    if len(paths) > 1:
+        raise DataError(f"{path}: holds {len(paths)} runs; name the one to export")
+    return paths[0]
+
+
+def _controller_of(run: Run, experiment: Experiment) -> GPMPC:
+    """Returns the controller of a run, around a model that is learned again.
+
+    Raises:
+        SettingError: It is none that can be exported.
+    """
+    if experiment.learning is not None:
+        rule = "an exported controller does not learn; fly without"
+        got = type(experiment.learning).__name__
+        raise SettingError("learning", f"{rule}; got {got}")
+    model: Any = experiment.flown
+    if experiment.learns:
+        model = experiment.model
+        if model is None:
+            with one_thread(), errors_of_settings(run):
+                rows = experiment.training_rows()
+                model = experiment.learn(rows, experiment.seed).posterior
+    return experiment.controller(model)
+
+
+def _questions(
+    run: Run, experiment: Experiment, controller: GPMPC
+) -> Iterator[Question]:
+    """Yields what the controller was asked in the flight."""
+    H = controller.horizon
+    path = experiment.references(int(run.steps.max(initial=0)) + H + 2)
+    inputs = np.tile(controller.initial_input, (H, 1))
+    for k, measured in zip(run.steps.tolist(), run.measured, strict=True):
+        yield Question(measured, Reference(path[k : k + H + 1], inputs))
+
+
+def _measure(
+    controller: GPMPC, questions: list[Question], precision: Any, policy: Any
+) -> dict[str, Any]:
+    """Returns memory and times of the compiled code, and how it differs."""
+    python = ControlLoop(controller, policy)
+    compiled = CompiledLoop(controller, precision, policy)
+    differences = [0.0]
+    other_statuses = 0
+    seconds = [0.0]
+    for measured, reference in questions:
+        expected = python.input(measured, reference)
+        input = compiled.input(measured, reference)
+        assert python.last is not None  # it has decided
+        differences.append(float(np.abs(input - expected).max()))
+        other_statuses += compiled.status is not python.last.status
+        seconds.append(compiled.seconds)
+    return {
+        "memory_bytes": compiled.memory_bytes,
+        "median_us": 1e6 * float(np.median(seconds)),
+        "longest_us": 1e6 * max(seconds),
+        "largest_difference": max(differences),
+        "other_statuses": int(other_statuses),
+    }
