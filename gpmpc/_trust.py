@@ -38,6 +38,27 @@ MODEL_CODE = frozenset(
     }
 )
 
+#: what makes a system of numbers: a saved model of a log, or a mapping, may name it
+SYSTEM_CODE = frozenset(
+    f"gpmpc.systems:{name}"
+    for name in [
+        "DifferentialDrive",
+        "DynamicBicycle",
+        "KinematicBicycle",
+        "LaggedDifferentialDrive",
+        "acrobot",
+        "cart_pole",
+        "differential_drive",
+        "double_integrator",
+        "double_pendulum",
+        "dynamic_bicycle",
+        "kinematic_bicycle",
+        "pendulum",
+        "planar_quadrotor",
+        "stirred_tank",
+    ]
+)
+
 _SETTINGS = {
     "gpmpc.datasets": "ExcitedData Excitation NMPCData PaperData RandomData Tracking",
     "gpmpc.export": "compiled_controller",
@@ -55,8 +76,8 @@ _SETTINGS = {
     "gpmpc.qp": "CvxpySolver DualActiveSet PrimalActiveSet",
     "gpmpc.simulation": "Dropout Gust Noise Replaced",
     "gpmpc.systems": "Coupled Map Rotational System Translational acrobot cart_pole "
-    "coupled double_integrator double_pendulum pendulum planar_quadrotor rotational "
-    "stirred_tank translational",
+    "coupled differential_drive double_integrator double_pendulum dynamic_bicycle "
+    "kinematic_bicycle pendulum planar_quadrotor rotational stirred_tank translational",
     "gpmpc.systems.gymnasium_": "gymnasium_system",
     "gpmpc.systems.mujoco_": "mujoco_system",
     "gpmpc.systems.mujoco_quadrotor": "RigidBody mujoco_quadrotor",

@@ -86,6 +86,7 @@ def fit_nominal(
             residuals,
             theta0,
             residuals.jacobian,
+            bounds=_bounds(model, lags),
             loss="soft_l1",
             x_scale="jac",
             xtol=1e-4,
@@ -99,6 +100,15 @@ def fit_nominal(
     )
     fitted = replace(model, theta=theta[:count], time_constants=time_constants)
     return NominalFit(fitted, standard_errors[:count])
+
+
+def _bounds(model: LogModel, lags: int) -> tuple[Array, Array]:
+    """Returns the smallest and largest parameters (P,), those of the lags behind."""
+    count = len(model.nominal.parameter_names)
+    infinite = np.full(count, np.inf)
+    low, high = getattr(model.nominal, "bounds", (-infinite, infinite))
+    endless = np.full(lags, np.inf)
+    return np.concatenate([low, -endless]), np.concatenate([high, endless])
 
 
 class _RolloutResiduals:

@@ -19,6 +19,7 @@ from gpmpc.exceptions import (
     check_numbers,
 )
 from gpmpc.logs._mapping_text import load_mapping_text
+from gpmpc.logs._nominal_system import NominalSystem
 from gpmpc.logs._units import Conversion, conversion
 from gpmpc.models._state_space import StateGroup, StateSpace
 
@@ -238,7 +239,11 @@ class LogMapping:
     held: str = "drop"
     #: "drop" leaves out parts in which nothing moves; "use" takes them
     rest: str = "drop"
-    model: str = "none"  #: what is known of the system: "rigid_body" or "none"
+    #: what is known of the system: "rigid_body", "bicycle", "differential_drive" or
+    #: "none"
+    model: str = "none"
+    #: a system with named parameters, which are fitted; none by default
+    nominal: NominalSystem | None = None
     #: times of a bag's messages: "header" takes the stamps that they carry, "log" the
     #: times at which they were logged; empty takes what gives the topics time in common
     stamp: str = ""
@@ -256,12 +261,16 @@ class LogMapping:
         for key, choices in (
             ("held", ("drop", "use")),
             ("rest", ("drop", "use")),
-            ("model", ("rigid_body", "none")),
+            ("model", ("rigid_body", "bicycle", "differential_drive", "none")),
             ("stamp", ("", "header", "log")),
         ):
             check_choice(key, getattr(self, key), choices)
         check_choice(_AXES_KEY, self.axes, ("", *AXES))
-        if self.axes and self.model == "none":
+        if self.nominal is not None and self.model != "none":
+            raise SettingError(
+                "nominal", f"must stand alone; got model: {self.model} as well"
+            )
+        if self.axes and self.model != "rigid_body":
             raise SettingError(
                 _AXES_KEY, f"needs model: rigid_body; got {self.axes} without one"
             )
@@ -424,13 +433,15 @@ class LogMapping:
         Raises:
             SettingError: A key or value is wrong.
         """
-        keys = ("time", "keep", "names", "run", "runs", *_PLAIN_KEYS, _AXES_KEY, *ROLES)
+        keys = ("time", "keep", "names", "run", "runs", "nominal", *_PLAIN_KEYS)
+        keys = (*keys, _AXES_KEY, *ROLES)
         _check_keys("mapping", content, keys)
         signals = [signal for role in ROLES for signal in _read_signals(role, content)]
         time = content.get("time") or {}
         if not isinstance(time, Mapping):
             time = {"column": _as_name(time)}
         _check_keys("time", time, ("column", "unit", "step"))
+        nominal = content.get("nominal")
         settings = {key: content[key] for key in _PLAIN_KEYS if key in content}
         return cls(
             signals=tuple(signals),
@@ -442,6 +453,7 @@ class LogMapping:
             runs=_read_runs(content.get("runs") or {}),
             keep=_read_ranges(content.get("keep") or {}),
             axes=content.get(_AXES_KEY, ""),
+            nominal=NominalSystem.from_plain(nominal) if nominal else None,
             **settings,
         )
 

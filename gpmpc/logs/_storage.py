@@ -72,23 +72,33 @@ def save_learned(learned: IdentifiedModel, path: str | Path) -> None:
     write_model(path, LOG_MODEL, header, tensors)
 
 
-def load_learned(path: str | Path) -> IdentifiedModel:
+def load_learned(path: str | Path, trusted: Sequence[str] = ()) -> IdentifiedModel:
     """Reads a file of ``save_learned``.
 
+    Args:
+        path: The file.
+        trusted: Names of packages whose code the file may name, such as that of a
+            nominal system.
+
     Raises:
-        DataError: The file is missing, damaged, of another kind or of a newer format.
+        DataError: The file is missing, damaged, of another kind or of a newer format,
+            or names code that is not trusted.
     """
+    packages = trusted_packages("trusted", trusted)
     path = existing_file(path, "what gpmpc learn saved")
     header, tensors = read_model(path, LOG_MODEL)
     with consistent(path, f"not a readable {LOG_MODEL}"):
-        return _learned_of_parts(path, header, tensors)
+        return _learned_of_parts(path, header, tensors, packages)
 
 
 def _learned_of_parts(
-    path: Path, header: Mapping[str, Any], tensors: Mapping[str, Tensor]
+    path: Path,
+    header: Mapping[str, Any],
+    tensors: Mapping[str, Tensor],
+    trusted: Sequence[str],
 ) -> IdentifiedModel:
     """Makes what was learned of a file's header and tensors."""
-    named = log_model_of_parts(path, header, tensors)
+    named = log_model_of_parts(path, header, tensors, trusted)
     model = named.model
     _, _, _, runs = header["names"]
     standard_errors = tensors["standard_errors"].numpy()

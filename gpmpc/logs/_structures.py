@@ -3,7 +3,8 @@
 A structure is a nominal model with its history and lag, grown by one addition after the
 other, and GPs on groups of outputs. ``bases`` lists those that a search begins with.
 
-To add a structure for another kind of system:
+A mapping may name any system (``nominal``), and vehicles stand in
+``_system_structures``. To add a structure for another kind of system that is none:
 
 1. Write its nominal model beside ``MultirotorNominal`` (``gpmpc.models._parametric``),
    and its kinematics beside ``RigidBodyKinematics`` (``gpmpc.models._kinematics``)
@@ -25,10 +26,12 @@ import numpy as np
 from gpmpc._dynamics import Array
 from gpmpc.logs._fitting import PAST
 from gpmpc.logs._log import Log
+from gpmpc.logs._system_structures import system_nominal
 from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._memory import Memory
 from gpmpc.models._parametric import AffineNominal, MultirotorNominal
+from gpmpc.models._system_nominal import SystemNominal
 
 LATE = 3  # rows by which motors may act late
 # Rows over which the residuals before a start are averaged to a disturbance: all of the
@@ -148,7 +151,24 @@ def bases(log: Log) -> list[Structure]:
     if log.mapping.model == "rigid_body":
         body = RigidBodyKinematics(log.space)
         return [_multirotor_base(log), *_affine_bases(body, len(log.input_names))]
-    return _affine_bases(Increments(log.space), len(log.input_names))
+    kinematics = Increments(log.space)
+    affine_bases = _affine_bases(kinematics, len(log.input_names))
+    nominal = system_nominal(log)
+    if nominal is None:
+        return affine_bases
+    return [_system_base(nominal, kinematics, len(log.input_names)), *affine_bases]
+
+
+def _system_base(
+    nominal: SystemNominal, kinematics: Increments, inputs: int
+) -> Structure:
+    model = LogModel(
+        kinematics=kinematics,
+        nominal=nominal,
+        theta=np.empty(0),
+        history=(0,) * len(kinematics.output_names),
+    )
+    return Structure(nominal.code.rpartition(":")[2], model, inputs)
 
 
 def _multirotor_base(log: Log) -> Structure:

@@ -101,7 +101,7 @@ def load_model(path: str | Path, trusted: Sequence[str] = ()) -> Any:
     path = existing_file(path, "a saved model")
     kind = load_metadata(path).get("kind")
     if kind == LOG_MODEL:
-        return read_log_dynamics(path)
+        return read_log_dynamics(path, packages)
     if not isinstance(kind, str) or kind not in _MODELS:
         expected = ", ".join(_MODELS)
         raise DataError(f"{path}: holds a {brief(kind)}; expected one of {expected}")

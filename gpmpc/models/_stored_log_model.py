@@ -9,7 +9,7 @@ of the identification.
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from gpmpc._dynamics import Array
+from gpmpc._trust import SYSTEM_CODE, trusted_code
 from gpmpc.exceptions import DataError, SettingError, check_choice, check_number
 from gpmpc.gp._storage import (
     consistent,
@@ -35,7 +36,9 @@ from gpmpc.models._memory import NO_MEMORY, Memory
 from gpmpc.models._older_files import STILL
 from gpmpc.models._parametric import AffineNominal, MultirotorNominal
 from gpmpc.models._state_space import StateGroup, StateSpace
+from gpmpc.models._stored_functions import check_code_name
 from gpmpc.models._stored_values import tensors_below, texts
+from gpmpc.models._system_nominal import FittedParameter, SystemNominal
 from gpmpc.signals import Signals
 
 LOG_MODEL = "LogModel"  # the kind of the files
@@ -44,6 +47,7 @@ _INCREMENTS = "Increments"
 _AFFINE_NAMES = ("AffineNominal", STILL)  # as files call that nominal model
 _MULTIROTOR_NAME = "MultirotorNominal"
 _GROUPED_NAME = "GroupedNominal"
+_SYSTEM_NAME = "SystemNominal"
 _REGRESSION_TENSORS = ("mean", "deviation", "weights")
 _KINDS_OF_GROUPS = ("vector", "angle", "quaternion")
 _LONGEST = 10_000  # rows that a model from a file looks back
@@ -122,6 +126,8 @@ def _nominal_header(nominal: Any) -> list[Any]:
         return [name, asdict(nominal)]
     if isinstance(nominal, AffineNominal):
         return [name, {"fitted": nominal.fitted}]
+    if isinstance(nominal, SystemNominal):
+        return [name, nominal.settings]
     if isinstance(nominal, GroupedNominal):
         settings = {
             "parts": [_nominal_header(part) for part in nominal.parts],
@@ -133,16 +139,21 @@ def _nominal_header(nominal: Any) -> list[Any]:
     raise SettingError("nominal", f"{rule}; got {name}")
 
 
-def read_log_dynamics(path: Path) -> LogDynamics:
+def read_log_dynamics(path: Path, trusted: Sequence[str] = ()) -> LogDynamics:
     """Reads a model of a log that a controller can plan with.
 
+    Args:
+        path: Of the file.
+        trusted: Packages whose code the file may name.
+
     Raises:
-        DataError: The file is damaged, of another kind or of a newer format.
+        DataError: The file is damaged, of another kind or of a newer format, or names
+            code that is not trusted.
         SettingError: No controller can plan with the model.
     """
     header, tensors = read_model(path, LOG_MODEL)
     with consistent(path, f"not a readable {LOG_MODEL}"):
-        named = log_model_of_parts(path, header, tensors)
+        named = log_model_of_parts(path, header, tensors, trusted)
     if named.context_names:
         context = ", ".join(named.context_names)
         rule = f"needs a context ({context}), which is not known in flight"
@@ -157,7 +168,10 @@ def read_log_dynamics(path: Path) -> LogDynamics:
 
 
 def log_model_of_parts(
-    path: Path, header: Mapping[str, Any], tensors: Mapping[str, Tensor]
+    path: Path,
+    header: Mapping[str, Any],
+    tensors: Mapping[str, Tensor],
+    trusted: Sequence[str] = (),
 ) -> NamedLogModel:
     """Makes a model of a log of a file's header and tensors.
 
@@ -168,6 +182,15 @@ def log_model_of_parts(
     input_names = texts("input_names", input_values)
     context_names = texts("context_names", context_values)
     kinematics = _kinematics(header["kinematics"], _space(header["groups"]))
+    log = _LogOfNominal(
+        path=path,
+        kinematics=kinematics,
+        state_names=texts("state_names", state_values),
+        input_names=input_names,
+        context_names=context_names,
+        time_step=header["time_step"],
+        trusted=tuple(trusted),
+    )
     features = kinematics.features(
         states=kinematics.space.origin[None],
         inputs=np.zeros((1, len(input_names))),
@@ -185,7 +208,7 @@ def log_model_of_parts(
         _check_gp(gps[-1], seen)
     model = LogModel(
         kinematics=kinematics,
-        nominal=_nominal(header["nominal"], kinematics, input_names, context_names),
+        nominal=_nominal(header["nominal"], log),
         theta=tensors["theta"].numpy(),
         history=tuple(header["history"]),
         lag=header["lag"],
@@ -273,12 +296,21 @@ def _kinematics(name: str, space: StateSpace) -> Kinematics:
     return RigidBodyKinematics(space)
 
 
+class _LogOfNominal(NamedTuple):
+    """What a nominal model in a file is of, and whose code the file may name."""
+
+    path: Path
+    kinematics: Kinematics
+    state_names: tuple[str, ...]
+    input_names: tuple[str, ...]
+    context_names: tuple[str, ...]
+    time_step: float
+    trusted: tuple[str, ...]
+
+
 def _nominal(
-    name_and_settings: Any,
-    kinematics: Kinematics,
-    input_names: tuple[str, ...],
-    context_names: tuple[str, ...],
-) -> MultirotorNominal | AffineNominal | GroupedNominal:
+    name_and_settings: Any, log: _LogOfNominal
+) -> MultirotorNominal | AffineNominal | GroupedNominal | SystemNominal:
     """Makes a nominal model of its name and settings.
 
     Raises:
@@ -286,30 +318,67 @@ def _nominal(
     """
     name, settings = name_and_settings
     if name in _AFFINE_NAMES:
-        return AffineNominal(kinematics, settings.get("fitted", name != STILL))
+        return AffineNominal(log.kinematics, settings.get("fitted", name != STILL))
+    if name == _SYSTEM_NAME:
+        return _system_nominal(settings, log)
     if name == _GROUPED_NAME:
         return GroupedNominal(
-            parts=tuple(
-                _nominal(part, kinematics, input_names, context_names)
-                for part in settings["parts"]
-            ),
+            parts=tuple(_nominal(part, log) for part in settings["parts"]),
             outputs_of=tuple(tuple(outputs) for outputs in settings["outputs_of"]),
             sizes=tuple(settings["sizes"]),
         )
     if name != _MULTIROTOR_NAME:
-        names = ", ".join((*_AFFINE_NAMES, _MULTIROTOR_NAME, _GROUPED_NAME))
+        own = (*_AFFINE_NAMES, _MULTIROTOR_NAME, _GROUPED_NAME, _SYSTEM_NAME)
+        names = ", ".join(own)
         raise DataError(f"unknown nominal model {name!r:.80}; known are {names}")
     motors = settings["motors"]
-    inputs = len(input_names)
+    inputs = len(log.input_names)
     if type(motors) is not int or motors != inputs:
         raise DataError(f"a multirotor of {inputs} inputs has no {motors!r:.80} motors")
     voltage = settings.get("voltage", 0.0)
     check_number("voltage", voltage, least=0)
-    if voltage and not context_names:
+    if voltage and not log.context_names:
         raise DataError("a multirotor whose voltage counts has it in its context")
-    if not isinstance(kinematics, RigidBodyKinematics):
+    if not isinstance(log.kinematics, RigidBodyKinematics):
         raise DataError("a multirotor is a rigid body")
     return MultirotorNominal(**settings)
+
+
+def _system_nominal(settings: Mapping[str, Any], log: _LogOfNominal) -> SystemNominal:
+    """Makes a system of the code and the parameters that a file names.
+
+    Raises:
+        DataError: The code may not be imported, or is not that of a system.
+    """
+    code = settings["code"]
+    if code in SYSTEM_CODE:
+        factory = trusted_code(code, ["gpmpc"])
+    else:
+        check_code_name(log.path, "nominal", code, log.trusted)
+        factory = trusted_code(code, log.trusted)
+    if not isinstance(log.kinematics, Increments):
+        raise DataError("the states of a system are no rigid body's")
+    fixed = settings["fixed"]
+    for name, value in fixed.items():
+        if not isinstance(value, bool | int | float | str):
+            raise DataError(f"fixed.{name} must be a number or a text")
+    return SystemNominal(
+        factory=factory,
+        code=code,
+        fitted=tuple(
+            FittedParameter(
+                name=str(name),
+                start=float(start),
+                low=-np.inf if low is None else float(low),
+                high=np.inf if high is None else float(high),
+            )
+            for name, start, low, high in settings["fitted"]
+        ),
+        time_step=log.time_step,
+        state_names=log.state_names,
+        input_names=log.input_names,
+        fixed=fixed,
+    )
 
 
 def _correction(

@@ -41,11 +41,24 @@ from gpmpc.systems._textbook import (
     planar_quadrotor,
     stirred_tank,
 )
+from gpmpc.systems._vehicles import (
+    DifferentialDrive,
+    DynamicBicycle,
+    KinematicBicycle,
+    LaggedDifferentialDrive,
+    differential_drive,
+    dynamic_bicycle,
+    kinematic_bicycle,
+)
 
 __all__ = [
     "ATTITUDES",
     "GRAVITY",
     "Coupled",
+    "DifferentialDrive",
+    "DynamicBicycle",
+    "KinematicBicycle",
+    "LaggedDifferentialDrive",
     "Map",
     "Rotational",
     "System",
@@ -61,9 +74,12 @@ __all__ = [
     "cos",
     "cosh",
     "coupled",
+    "differential_drive",
     "double_integrator",
     "double_pendulum",
+    "dynamic_bicycle",
     "exp",
+    "kinematic_bicycle",
     "log",
     "max",
     "min",
