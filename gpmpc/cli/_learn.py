@@ -16,7 +16,7 @@ from gpmpc import logs
 from gpmpc._files import write_whole
 from gpmpc._provenance import code_fingerprint, provenance
 from gpmpc.cli._commands import Result
-from gpmpc.cli._settings import write_files, writing
+from gpmpc.cli._settings import find_modules_here, write_files, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.logs import IdentifiedModel, Judgement, Log
 from gpmpc.plotting import judgement_figure, png
@@ -41,6 +41,7 @@ def learn(arguments: argparse.Namespace) -> Result:
     """
     console = Console(soft_wrap=True, highlight=False, markup=False)
     folder = arguments.to or Path("learned")
+    find_modules_here()  # which a mapping may name a system of
     log = logs.read_log(arguments.files, arguments.mapping, arguments.partial)
     console.print(repr(log))
     for finding in log.findings:
@@ -140,10 +141,13 @@ def _fingerprint(arguments: argparse.Namespace, train: Log) -> str:
         arguments.seed,
         arguments.for_control,
     )
+    content = {"settings": repr(settings)}
+    if train.mapping.nominal is not None:  # whose code counts as well
+        content["_target_"] = train.mapping.nominal.code.replace(":", ".")
     arrays = []
     for run in train:
         arrays += [run.states, run.inputs, run.context]
-    return fingerprint(repr(settings), arrays)
+    return fingerprint(content, arrays)
 
 
 def _split(log: Log, held_out: Sequence[str]) -> tuple[Log, Log]:

@@ -1,0 +1,380 @@
+"""Vehicles, and systems of the user, are structures whose parameters a log tells."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas
+import pytest
+import torch
+import yaml
+
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.gp._storage import write_model
+from gpmpc.logs import (
+    LogMapping,
+    fit_nominal,
+    learn,
+    load_flyable,
+    load_learned,
+    read_log,
+    save_learned,
+)
+from gpmpc.logs._structures import bases
+from gpmpc.models._log_dynamics import OutputNoise
+from gpmpc.models._stored_log_model import (
+    LOG_MODEL,
+    NamedLogModel,
+    log_model_parts,
+)
+from gpmpc.models._system_nominal import FittedParameter, SystemNominal
+from gpmpc.systems import (
+    KinematicBicycle,
+    System,
+    differential_drive,
+    dynamic_bicycle,
+    kinematic_bicycle,
+    pendulum,
+    step,
+)
+from gpmpc.testing import check_model
+
+sys.path.append(str(Path(__file__).resolve().parents[2]))
+from tests.cli.command import forked
+
+HEADING = {"columns": ["heading"], "kind": "angle", "unit": "rad"}
+POSITION = {"columns": ["x", "y"], "unit": "m"}
+CAR = {
+    "time": "t",
+    "rest": "use",
+    "model": "bicycle",
+    "states": {
+        "position": POSITION,
+        "heading": HEADING,
+        "speed": {"columns": ["speed"], "unit": "m/s"},
+    },
+    "inputs": {
+        "steering": {"columns": ["steering"], "unit": "rad"},
+        "drive": ["drive"],
+    },
+}
+PENDULUM = {
+    "time": "t",
+    "rest": "use",
+    "states": {"angle": ["angle"], "rate": ["rate"]},
+    "inputs": {"torque": ["torque"]},
+}
+
+
+def flight(plant, inputs, noise=0.0, seed=0):
+    """A table of what a plant does under inputs (K, m)."""
+    rng = np.random.default_rng(seed)
+    states = [np.array(plant.start)]
+    for u in inputs[:-1]:
+        states.append(step(plant, states[-1], u))
+    rows = np.array(states) + noise * rng.normal(size=(len(inputs), len(states[0])))
+    table = pandas.DataFrame(rows, columns=plant.state_names)
+    table.insert(0, "t", plant.time_step * np.arange(len(inputs)))
+    return table.assign(**dict(zip(plant.input_names, inputs.T, strict=True)))
+
+
+def excitation(rows, *waves, time_step=0.02):
+    """Inputs (K, m): each a mean, and two sines of an amplitude."""
+    time = time_step * np.arange(rows)
+    columns = [
+        mean + high * np.sin((1.3 + i) * time) + high / 3 * np.sin((3.7 - i) * time)
+        for i, (mean, high) in enumerate(waves)
+    ]
+    return np.column_stack(columns)
+
+
+def log_of(folder, table, mapping):
+    path = folder / "log.csv"
+    table.to_csv(path, index=False)
+    return read_log(path, mapping)
+
+
+def fitted_values(log, steps=15):
+    """The fitted parameters of the first structure, and the structure."""
+    structure = bases(log)[0]
+    fit = fit_nominal(structure.model, None, log, steps)
+    return {name: value for name, value, _ in fit.to_rows()}, structure
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_kinematic_bicycle_is_found_whatever_its_steering_means(tmp_path, sign):
+    plant = kinematic_bicycle(
+        0.02,
+        curvature=3,
+        rear_length=0.16,
+        steering_offset=0.03,
+        drive_gain=4,
+        drag=0.8,
+    )
+    inputs = excitation(600, (0, 0.3), (0.4, 0.3))
+    table = flight(plant, inputs, noise=0.003)
+    table["steering"] *= sign
+    table["heading"] = np.arctan2(np.sin(table["heading"]), np.cos(table["heading"]))
+    values, structure = fitted_values(log_of(tmp_path, table, CAR))
+    assert structure.name == "KinematicBicycle"
+    assert values["curvature"] == pytest.approx(3 * sign, rel=0.02)
+    assert values["steering_offset"] == pytest.approx(0.03 * sign, abs=0.003)
+    assert values["rear_length"] == pytest.approx(0.16, abs=0.02)
+    assert values["drive_gain"] == pytest.approx(4, rel=0.03)
+    assert values["drag"] == pytest.approx(0.8, rel=0.05)
+
+
+def test_steering_without_a_unit_is_one_that_turns_by_its_share(tmp_path):
+    plant = kinematic_bicycle(0.02, curvature=3)
+    inputs = excitation(400, (0, 0.15), (0.1, 0.3))
+    table = flight(plant, inputs).assign(steering=5 * inputs[:, 0])
+    mapping = {**CAR, "inputs": {"wheel": ["steering"], "drive": ["drive"]}}
+    values, structure = fitted_values(log_of(tmp_path, table, mapping))
+    scale = structure.model.nominal.fixed["steering_scale"]
+    assert scale * table["steering"].abs().max() == pytest.approx(0.4)
+    assert values["curvature"] == pytest.approx(3 / 5, rel=0.05)
+
+
+def test_a_dynamic_bicycle_predicts_what_its_tyres_do(tmp_path):
+    plant = dynamic_bicycle(
+        0.02, front_stiffness=45, rear_stiffness=60, drive_gain=4, drag=0.8
+    )
+    table = flight(plant, excitation(500, (0, 0.25), (0.5, 0.2)))
+    mapping = {
+        **CAR,
+        "states": {
+            "position": POSITION,
+            "heading": HEADING,
+            "velocity": ["forward_speed", "lateral_speed"],
+            "rate": ["yaw_rate"],
+        },
+    }
+    log = log_of(tmp_path, table, mapping)
+    structure = bases(log)[0]
+    fit = fit_nominal(structure.model, None, log, steps=15)
+    windows = log.windows(15, past=0, most=30)
+    errors = fit.model.rollout_errors(windows, [15])
+    still = windows.errors(
+        np.repeat(windows.states[:, :1], windows.ahead, axis=1), [15]
+    )
+    assert np.abs(errors).mean() < 0.01 * np.abs(still).mean()
+
+
+@pytest.mark.parametrize("wheels", [False, True])
+def test_a_differential_drive_is_found_by_speeds_or_by_wheels(tmp_path, wheels):
+    plant = differential_drive(0.05, forward_by_first=0.8, turn_by_second=1.5)
+    told = excitation(300, (0.4, 0.3), (0.1, 0.8), time_step=0.05)
+    table = flight(plant, told)
+    if wheels:
+        left = told[:, 0] - 0.2 * told[:, 1]
+        table = table.assign(first=left, second=told[:, 0] + 0.2 * told[:, 1])
+    mapping = {
+        "time": "t",
+        "model": "differential_drive",
+        "states": {"position": POSITION, "heading": HEADING},
+        "inputs": {"told": ["first", "second"]},
+    }
+    values, _ = fitted_values(log_of(tmp_path, table, mapping))
+    expected = [0.4, 0.4, -3.75, 3.75] if wheels else [0.8, 0, 0, 1.5]
+    assert [*values.values()][:4] == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"inputs": {"drive": ["drive"]}}, "needs the states x, y, heading, speed; or"),
+        (
+            {"states": {"position": POSITION, "rest": ["heading", "speed"]}},
+            "kind: angle",
+        ),
+        ({"frame": "enu"}, "needs model: rigid_body"),
+        ({"nominal": "my_robot:Arm"}, "nominal: must stand alone"),
+    ],
+)
+def test_a_log_that_is_no_bicycles_is_refused(tmp_path, change, text):
+    table = flight(kinematic_bicycle(), excitation(50, (0, 0.1), (0, 0.1)))
+    with pytest.raises(SettingError, match=text):
+        bases(log_of(tmp_path, table, {**CAR, **change}))
+
+
+ARM = '''
+from dataclasses import dataclass
+
+from gpmpc.systems import GRAVITY, sin
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A pendulum whose inertia is made of its parameters when it is made."""
+
+    mass: float = 0.7
+    length: float = 0.8
+    damping: float = 0.2
+    name: str = "arm"
+
+    state_names = ("angle", "rate")
+    input_names = ("torque",)
+
+    def __post_init__(self):
+        if min(self.mass, self.length, self.damping) < 0:
+            raise ValueError("must be positive")
+        object.__setattr__(self, "inertia", self.mass * self.length**2 / 3)
+
+    def derivative(self, x, u):
+        weight = self.mass * GRAVITY * self.length / 2 * sin(x[0])
+        return [x[1], (weight - self.damping * x[1] + u[0]) / self.inertia]
+
+
+def make_arm(mass=0.7, length=0.8, damping=0.2):
+    return Arm(mass, length, damping)
+'''
+
+
+@pytest.fixture
+def arm(tmp_path, monkeypatch):
+    """A folder with a module of a user and a log of a pendulum."""
+    (tmp_path / "my_robot.py").write_text(ARM)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_robot", raising=False)
+    plant = pendulum(damping=0.1)
+    inputs = excitation(300, (0, 4.0), time_step=0.05)
+    flight(plant, inputs, noise=0.002).to_csv(tmp_path / "log.csv", index=False)
+    return tmp_path
+
+
+@pytest.mark.parametrize("nominal", ["my_robot:Arm", "my_robot.make_arm"])
+def test_a_users_own_system_is_fitted_with_what_it_derives(arm, nominal):
+    log = read_log(arm / "log.csv", {**PENDULUM, "nominal": nominal})
+    values, structure = fitted_values(log, steps=10)
+    truth = {"mass": 1.0, "length": 1.0, "damping": 0.1}
+    assert values == pytest.approx(truth, rel=0.1)
+    assert not structure.model.nominal._takes_arrays
+    low, _ = structure.model.nominal.bounds
+    assert (low > 0).all()  # negative ones are refused
+
+
+def test_start_bounds_and_fixed_arguments_are_the_mappings(arm):
+    entry = {
+        "system": "gpmpc.systems:pendulum",
+        "parameters": {"length": {"start": 0.9, "low": 0.5, "high": 0.95}, "mass": 1.1},
+        "fixed": {"damping": 0.1},
+    }
+    log = read_log(arm / "log.csv", {**PENDULUM, "nominal": entry})
+    values, structure = fitted_values(log, steps=10)
+    assert [*values] == ["length", "mass"]
+    assert values["length"] == pytest.approx(0.95, abs=1e-3)
+    assert structure.model.nominal._takes_arrays
+    assert structure.model.nominal.fixed == {"damping": 0.1}
+
+
+def test_columns_in_another_order_are_found_by_their_names(arm):
+    states = {"rate": ["rate"], "angle": ["angle"]}
+    log = read_log(
+        arm / "log.csv",
+        {**PENDULUM, "states": states, "nominal": "gpmpc.systems:pendulum"},
+    )
+    values, _ = fitted_values(log, steps=10)
+    assert values == pytest.approx({"mass": 1, "length": 1, "damping": 0.1}, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("nominal", "text"),
+    [
+        ("os:system", "os:system makes no system"),
+        ("subprocess.run", "makes no system"),
+        ("gpmpc.logs:learn", "makes no system; of gpmpc itself there are"),
+        ("arm", "must be such as my_robot:Arm"),
+        ({"parameters": {}}, "nominal.system: must be such as"),
+        ({"system": "a:b", "start": 1}, "nominal.start: no such key"),
+        ({"system": "a:b", "parameters": {"m": "x"}}, "parameters.m.start: must be a"),
+        ({"system": "a:b", "parameters": {"m": {"low": 1}}}, "m.start: must be given"),
+        (
+            {"system": "a:b", "parameters": {"m": {"start": 3, "high": 1}}},
+            "parameters.m: must start between -inf and 1; got 3",
+        ),
+    ],
+)
+def test_what_names_no_system_is_refused(nominal, text):
+    with pytest.raises(SettingError, match=text):
+        LogMapping.from_dict({**PENDULUM, "nominal": nominal})
+
+
+@pytest.mark.parametrize(
+    ("nominal", "text"),
+    [
+        ("no_robot:Arm", "no_robot:Arm cannot be imported here"),
+        ("my_robot:Leg", "my_robot:Leg cannot be imported here"),
+        ("my_robot.GRAVITY", "which my_robot only imports"),
+        ({"system": "my_robot:Arm", "parameters": {"width": 1}}, "cannot be made"),
+        ("gpmpc.systems:cart_pole", "has the states position, velocity, angle, rate"),
+    ],
+)
+def test_a_system_that_does_not_fit_is_refused(arm, nominal, text):
+    log = read_log(arm / "log.csv", {**PENDULUM, "nominal": nominal})
+    with pytest.raises(SettingError, match=text):
+        bases(log)
+
+
+def test_a_file_names_the_users_code_and_reads_it_only_where_it_is_trusted(arm):
+    log = read_log(arm / "log.csv", {**PENDULUM, "nominal": "my_robot:Arm"})
+    fit = fit_nominal(bases(log)[0].model, None, log, steps=5)
+    noise = OutputNoise(np.ones((4, 2)), np.ones(2))
+    names = (log.space.names, log.input_names, ())
+    path = arm / "model.safetensors"
+    named = NamedLogModel(fit.model, noise, *names, log.time_step)
+    write_model(path, LOG_MODEL, *log_model_parts(path, named))
+    with pytest.raises(DataError, match=r"trusted=\['my_robot'\].*model.trusted="):
+        load_flyable(path)
+    saved = load_flyable(path, ["my_robot"])
+    saved.check(pendulum())
+    states = np.array([[0.1, 0.2], [2.0, -1.0]])
+    inputs = np.array([[0.3], [1.0]])
+    truth = [
+        step(pendulum(damping=0.1), *pair) for pair in zip(states, inputs, strict=True)
+    ]
+    check_model(saved.model, torch.from_numpy(states), torch.from_numpy(inputs))
+    predicted = saved.model.linearize(states, inputs).mean
+    np.testing.assert_allclose(predicted, truth, atol=2e-3)
+
+
+@pytest.mark.slow
+def test_what_was_learned_is_stored_trusted_and_flown(arm):
+    mapping = {**PENDULUM, "nominal": "my_robot:Arm"}
+    (arm / "map.yaml").write_text(yaml.safe_dump(mapping))
+    log = read_log(arm / "log.csv", mapping)
+    learned = learn(log, points=20, steps=5, for_control=True)
+    chosen = next(one.name for one in learned.candidates if one.chosen)
+    assert chosen.startswith("Arm")
+    save_learned(learned, arm / "model.safetensors")
+    with pytest.raises(DataError, match=r"trusted=\['my_robot'\]"):
+        load_learned(arm / "model.safetensors")
+    again = load_learned(arm / "model.safetensors", trusted=["my_robot"])
+    windows = log.windows(5, past=30, most=20)
+    np.testing.assert_array_equal(
+        again.model.rollout(windows), learned.model.rollout(windows)
+    )
+    saved = load_flyable(arm / "model.safetensors", ["my_robot"])
+    saved.check(pendulum())
+    command = ["run", "system=pendulum", "model=model.safetensors", "steps=3"]
+    refused = forked(*command, cwd=arm)
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+    flown = forked(*command, "model.trusted=[my_robot]", cwd=arm)
+    assert flown.returncode == 0, flown.stderr
+
+
+def test_a_system_of_another_time_step_or_simulator_is_refused():
+    def nominal(factory):
+        return SystemNominal(
+            factory=factory,
+            code="my_robot:make",
+            fitted=(FittedParameter("curvature", 1.0),),
+            time_step=0.1,
+            state_names=("a", "b", "c", "d"),
+            input_names=("u", "v"),
+        )
+
+    assert nominal(KinematicBicycle).start == [1.0]
+    with pytest.raises(SettingError, match="time step of 0.05 s, and the log one of"):
+        nominal(lambda curvature: System(KinematicBicycle(curvature), 0.05))
+    with pytest.raises(SettingError, match="cannot be made"):
+        nominal(lambda: KinematicBicycle())
