@@ -69,6 +69,10 @@ class Recording:
     Raises:
         ShapeError: There is not one state more than inputs, or no input.
         DataError: An entry is not finite.
+
+    >>> import numpy as np
+    >>> len(Recording(states=np.zeros((11, 2)), inputs=np.zeros((10, 1))))
+    10
     """
 
     states: Tensor  #: x[0] to x[K] (K + 1, n)
@@ -213,6 +217,10 @@ def calibrate(
         ShapeError: Recordings, model or names do not belong together.
         SettingError: A level is not between 0 and 1, no recording is as long as the
             horizon, or a deviation of the sensors is negative.
+
+    See Also:
+        ``Recording.chained``, which finds the runs in transitions;
+        ``gpmpc.plotting.calibration_figure``.
     """
     recordings = [recordings] if isinstance(recordings, Recording) else list(recordings)
     for recording in recordings:

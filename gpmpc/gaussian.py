@@ -51,6 +51,14 @@ class Gaussian:
     Raises:
         ShapeError: The shapes do not belong together.
         SettingError: One of the two is no tensor.
+
+    >>> import torch
+    >>> belief = Gaussian(torch.zeros(2), 0.25 * torch.eye(2))
+    >>> belief.dim, belief.variance.sqrt().tolist()
+    (2, [0.5, 0.5])
+
+    See Also:
+        ``Gaussian.certain``, for a state that was measured exactly.
     """
 
     mean: Tensor  #: (*batch, n)

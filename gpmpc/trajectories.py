@@ -230,6 +230,10 @@ class Waypoints:
 
     A monotone cubic (Fritsch and Carlson, 1980) per coordinate: it passes every
     waypoint and overshoots none.
+
+    >>> path = Waypoints(times=[0.0, 10.0], positions=[[0.0, 0.0], [4.0, 2.0]])
+    >>> path(5.0).round(3).tolist()
+    [2.0, 1.0]
     """
 
     times: Sequence[float]  #: strictly increasing times of the waypoints [s]

@@ -31,6 +31,13 @@ class RandomData:
 
     Raises:
         SettingError: A number out of range, or an unknown word.
+
+    >>> from gpmpc.systems import pendulum
+    >>> RandomData(samples=20, episode=5).transitions(pendulum())
+    Transitions(20 rows, n=2, m=1)
+
+    See Also:
+        ``gpmpc.gp.Transitions`` for data of your own, ``gpmpc.logs.read_log`` for a log.
     """
 
     samples: int = 200  #: how many

@@ -68,6 +68,13 @@ class Measurement(TensorModel):
     Raises:
         ShapeError: R is not square.
         SettingError: R is no tensor, or an angle is no entry of y.
+
+    >>> seen = Measurement.of_states(4, states=[0, 2], std=[0.01, 0.02])
+    >>> seen.output_dim, seen.noise_covariance.diagonal().sqrt().tolist()
+    (2, [0.01, 0.02])
+
+    See Also:
+        ``KalmanFilter``, which takes it.
     """
 
     state_dim: int  #: n, of the state
@@ -232,6 +239,10 @@ class KalmanFilter:
     Raises:
         SettingError: Model and measurement have different states, or the propagator
             adds no process noise.
+
+    See Also:
+        ``Measurement``; ``LateMeasurements`` for those that come late; ``smooth`` for what
+        was filtered.
     """
 
     def __init__(

@@ -62,6 +62,16 @@ class GPPosterior(TensorModel):
     """Exact GPs, one per output, over the same N points.
 
     A training, ``from_hyperparameters`` or a file makes them.
+
+    For each output, with the kernel k, features X and targets y::
+
+        mean(x) = m + k(x, X) (K + sn^2 I)^-1 (y - m)
+        variance(x) = sf^2 - k(x, X) (K + sn^2 I)^-1 k(X, x)
+        k(x, x') = sf^2 exp(-1/2 sum_i (x_i - x'_i)^2 / l_i^2)
+
+    See Also:
+        ``Trainer``, which makes it of data; ``save_posterior``; ``append_transitions`` for
+        further data.
     """
 
     features: Tensor  #: x~ = (x, u) of the training points (N, n + m)

@@ -62,6 +62,11 @@ def standardize(
 
     A constant column is mapped to zero. A column whose range is at most ``resolution``,
     in the units of the data, counts as constant; the log names it.
+
+    >>> import torch
+    >>> scaling = standardize(torch.tensor([[1.0], [3.0]]), ["x"])
+    >>> scaling.scale(torch.tensor([[1.0], [3.0]])).flatten().tolist()
+    [-1.0, 1.0]
     """
     constant = _constant(columns, names, resolution)
     deviation = columns.std(dim=0, correction=0)

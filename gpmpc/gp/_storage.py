@@ -75,6 +75,9 @@ def save_posterior(
         SettingError: It is in another floating-point type, or the metadata are no JSON.
         DataError: The folder does not exist, or the posterior is inconsistent and could
             not be read again.
+
+    See Also:
+        ``load_posterior``, and ``gpmpc.models.save_model`` for models around a GP.
     """
     path = new_file(path)
     if metadata is not None and not isinstance(metadata, Mapping):
@@ -88,6 +91,9 @@ def load_posterior(path: str | Path) -> GPPosterior:
 
     Raises:
         DataError: The file is missing, damaged, of another kind or of a newer format.
+
+    See Also:
+        ``save_posterior``, and ``gpmpc.models.load_model`` for models around a GP.
     """
     path = existing_file(path, "a saved GPPosterior")
     header, tensors = read_model(path, "GPPosterior")

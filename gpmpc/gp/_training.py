@@ -93,6 +93,17 @@ class Trainer:
 
     Raises:
         SettingError: A setting is out of range.
+
+    >>> import numpy as np
+    >>> from gpmpc.gp import Transitions
+    >>> x = np.linspace(-1, 1, 8)[:, None]
+    >>> data = Transitions(states=x, inputs=x**2, next_states=0.9 * x + 0.1 * x**2)
+    >>> Trainer(restarts=0, predicts="difference")(data).posterior
+    GPPosterior(8 points, n=1, m=1, k=1, predicts='difference', torch.float64 on cpu)
+
+    See Also:
+        ``gpmpc.models.train``, which knows a system's angles and rates; ``SparseTrainer``
+        for thousands of points; ``Transitions``.
     """
 
     #: what the GPs learn: the next state, the difference to it, or any values, which

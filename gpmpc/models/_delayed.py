@@ -38,6 +38,9 @@ class DelayedModel(LinearWrapper):
     Raises:
         SettingError: The delay is no positive number, or the model does not predict
             next states.
+
+    See Also:
+        ``gpmpc.estimation.estimate_delay``, which finds the delay in a log.
     """
 
     model: DynamicsModel  #: without the delay, of n states and m inputs

@@ -47,6 +47,13 @@ class Reference:
 
     Raises:
         ShapeError: States, inputs and kappas do not belong together.
+
+    >>> import numpy as np
+    >>> Reference(np.zeros((11, 2)), inputs=np.zeros((10, 1))).states.shape
+    (11, 2)
+
+    See Also:
+        ``System.reference_states``, which makes the states along a trajectory.
     """
 
     #: r_0 .. r_H (H + 1, n); r_0 belongs to the current time. Or a set point (n,), for

@@ -38,6 +38,17 @@ class Tracking:
     Raises:
         SettingError: A weight is not symmetric positive semidefinite, R is zero in a
             direction, or a length is wrong.
+
+    Over the horizon H, with v the inputs, their deviations or their increments::
+
+        sum_(i=1..H) (x_i - r_i)' Q_i (x_i - r_i) + sum_(i=0..H-1) v_i' R_i v_i
+
+    >>> cost = Tracking(Q=[10.0, 1.0], R=[0.1], penalized="inputs")
+    >>> cost.Q.tolist()
+    [[10.0, 0.0], [0.0, 1.0]]
+
+    See Also:
+        ``Problem``, which takes it; ``LeastSquares`` for functions of the states.
     """
 
     #: state weights, the diagonal (n,) or the matrix (n, n); matrices (H, n, n) by
@@ -144,6 +155,12 @@ class LeastSquares:
     Raises:
         SettingError: y is no function, the weight is not symmetric positive
             semidefinite, or a length is wrong.
+
+    >>> LeastSquares(lambda x: x[:, :1] ** 2, weight=[1.0], reference=[4.0]).weight.tolist()
+    [[1.0]]
+
+    See Also:
+        ``Tracking`` for the states themselves; ``Problem``, whose ``outputs`` they are.
     """
 
     #: a function of tensors, states (H, n), inputs (H, m) and, where the controller is

@@ -84,6 +84,9 @@ class PredictionSettings:
     Raises:
         SettingError: An unknown form or covariance mode, a gain out of range, or one
             with ``"velocity"``.
+
+    >>> PredictionSettings(disturbance_gain=0.3).covariance
+    'zero_order'
     """
 
     #: where the dynamics are linearised: ``"trajectory"``, at every stage of the last

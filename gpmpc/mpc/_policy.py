@@ -187,6 +187,10 @@ class ControlLoop:
 
     Raises:
         SettingError: No such policy.
+
+    See Also:
+        ``gpmpc.simulation.closed_loop``, which does the same with a plant of this package;
+        the guide "Your own loop".
     """
 
     def __init__(self, controller: Controller, on_failure: OnFailure = "previous_plan"):

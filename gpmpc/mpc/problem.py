@@ -127,6 +127,16 @@ class Box(Constraint):
 
     Raises:
         SettingError: Crossed bounds, or as for ``Constraint``.
+
+    Of a state with a probability p it is E[x] + kappa std(x) <= upper, kappa the quantile
+    of the normal distribution at p, and likewise below.
+
+    >>> Box([-1.0, -math.inf], [1.0, math.inf], probability=0.95).size
+    2
+
+    See Also:
+        ``Halfspaces`` and ``Inequality``; ``Problem``, whose inputs, rates and constraints
+        they are.
     """
 
     #: list or array (d,), or (H, d) by stage, kept as an array; -inf where there is
@@ -211,6 +221,14 @@ class Halfspaces(Constraint):
     Raises:
         SettingError: Shapes that do not belong together, numbers that are not finite, a
             zero row, or as for ``Constraint``.
+
+    With a probability p it is F E[x] + kappa sqrt(diag(F Cov[x] F')) <= f.
+
+    >>> Halfspaces(F=[[1.0, 1.0]], f=[2.0], probability=0.95).size  # x_1 + x_2 <= 2
+    2
+
+    See Also:
+        ``Box`` for bounds of single states, ``Inequality`` for smooth functions.
     """
 
     F: Any  #: (r, n)
@@ -251,6 +269,16 @@ class Inequality(Constraint):
 
     Raises:
         SettingError: h is no function, or as for ``Constraint``.
+
+    >>> import torch
+    >>> def too_near(x, u, p):  # inside a disc of radius 0.3 around p
+    ...     return 0.3 - torch.linalg.vector_norm(x - p, dim=-1)
+    >>> Inequality(too_near, probability=0.95).count
+    1
+
+    See Also:
+        ``Box`` and ``Halfspaces``, which are linear; ``ControlLoop.input``, which takes the
+        parameters p.
     """
 
     #: a function of tensors or in CasADi, like y of ``LeastSquares``, that gives
@@ -284,6 +312,17 @@ class Problem:
 
     Raises:
         SettingError: A part is of another kind or length than the cost asks for.
+
+    >>> problem = Problem(
+    ...     Tracking(Q=[10.0, 1.0], R=[0.1]),
+    ...     inputs=Box([-2.0], [2.0]),
+    ...     constraints=[Box([-1.0, -math.inf], [1.0, math.inf])],
+    ... )
+    >>> problem.state_dim, problem.input_dim
+    (2, 1)
+
+    See Also:
+        ``GPMPC`` and the other controllers, which take it.
     """
 
     cost: Tracking  #: of states and inputs; its Q may be zero

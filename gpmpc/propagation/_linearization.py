@@ -91,7 +91,19 @@ def _is_gp_alone(form: AffineForm) -> bool:
 
 @explains_arguments
 class Linearization(NoisyPropagator):
-    """First order, with the model's noise unless ``process_noise=False``."""
+    """First order, with the model's noise unless ``process_noise=False``.
+
+    From N(mu, S) with an input u, the model's mean m, its Jacobian A at (mu, u) and its
+    variance V there, with the learned noise Sn::
+
+        mean = m(mu, u),     covariance = A S A' + V(mu, u) + Sn
+
+    >>> Linearization(process_noise=False).process_noise
+    False
+
+    See Also:
+        ``MomentMatching``, ``Unscented`` and ``MonteCarlo``, which also see curvature.
+    """
 
     #: needs the model's mean, derivatives and variance at the belief's mean alone, and
     #: carries the covariance by A S A' + V

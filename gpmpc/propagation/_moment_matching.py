@@ -54,6 +54,9 @@ class MomentMatching(NoisyPropagator):
             covariance is computed, at a quarter of the cost for six outputs.
         process_noise: Whether the noise variance sn2 is added to the predicted
             covariance. In the paper's tables it is not.
+
+    See Also:
+        ``Linearization``, which is faster and takes any model.
     """
 
     def __init__(self, diagonal: bool = False, process_noise: bool = True):

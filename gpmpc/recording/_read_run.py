@@ -35,6 +35,9 @@ def read_run(path: str | Path) -> Run:
     Raises:
         RecordingError: There is no such file, it is no recording of a run, or damage
             has left no step of it.
+
+    See Also:
+        ``replay``, which solves the program of a step again; ``McapRecorder``.
     """
     path = Path(path)
     content = read_content(path)

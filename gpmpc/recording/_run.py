@@ -160,6 +160,9 @@ def replay(run: Run, k: int) -> "QPSolution":
     Raises:
         RecordingError: The step or its problem is not in the recording, or it is no
             convex program.
+
+    See Also:
+        ``read_run``, which reads a recording.
     """
     recorded = run.problems.get(k)
     if recorded is None:

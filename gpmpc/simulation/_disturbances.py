@@ -57,6 +57,9 @@ class Gust(_Window):
 
     The plant integrates it like any other force. (Where the dynamics give the next
     state, it is added to that.)
+
+    >>> Gust({"vx": 0.5}, start=20.0, stop=40.0).rates
+    {'vx': 0.5}
     """
 
     #: what is added to the derivative of a state, by its name: ``{"vx": 2.0}`` is an

@@ -81,6 +81,10 @@ def closed_loop(
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was
             nothing to fall back on.
         Diverged: The system left the finite numbers; ``flown`` holds the steps before.
+
+    See Also:
+        ``closed_loops`` for many seeds; ``gpmpc.plotting.flight_figure``, which draws what
+        it returns; ``gpmpc.mpc.ControlLoop`` for a plant of your own.
     """
     if not (on_step is None or callable(on_step)):
         raise SettingError(
@@ -155,6 +159,9 @@ def closed_loops(
     Raises:
         SettingError: No seeds or equal ones; a model loop, in which a seed changes
             nothing; or a ``chunk`` below 1.
+
+    See Also:
+        ``closed_loop``, whose numbers a trial has.
     """
     _check_plant_of_trials(plant)
     scenario = Scenario(

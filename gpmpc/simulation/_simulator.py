@@ -72,6 +72,9 @@ class Noise:
 
     Raises:
         SettingError: An entry is negative or no number.
+
+    >>> Noise(measurement=[0.002, 0.01]).process is None
+    True
     """
 
     process: Sequence[float] | None = None  #: added to every next state (n,)

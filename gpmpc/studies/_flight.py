@@ -66,6 +66,10 @@ def run_trial(
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was
             nothing to fall back on.
         Diverged: The system left the finite numbers in its first step.
+
+    See Also:
+        ``Experiment``, all that it depends on; ``metrics``, its numbers;
+        ``gpmpc.simulation.closed_loop``, without data and training.
     """
     check_kind("experiment", experiment, Experiment, "Experiment(...)")
     training = None

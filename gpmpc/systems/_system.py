@@ -46,6 +46,19 @@ class System:
             dynamics without a finite value where the system starts.
         ShapeError: A list has another length than there are states or inputs, or the
             dynamics have.
+
+    >>> class Cart:
+    ...     state_names, input_names = ("position", "speed"), ("force",)
+    ...
+    ...     def derivative(self, x, u):
+    ...         return [x[1], u[0] - 0.2 * x[1]]
+    >>> plant = System(Cart(), time_step=0.1, units={"position": "m", "force": "N"})
+    >>> plant.name, plant.state_names, plant.unit
+    ('Cart', ('position', 'speed'), 'm')
+
+    See Also:
+        ``step`` and ``step_many``, which move it on; ``gpmpc.systems.pendulum`` and others
+        that come with the package; ``gpmpc.simulation.closed_loop``, which flies it.
     """
 
     #: names of states and inputs, and how it moves
@@ -415,6 +428,10 @@ def step_many(plant: System, states: Array, inputs: Array) -> Array:
     Raises:
         ShapeError: States or inputs are no table, or have another size.
         DataError: They are no real numbers.
+
+    >>> from gpmpc.systems import double_integrator
+    >>> step_many(double_integrator(), [[0.0, 1.0], [0.0, 2.0]], [[0.0], [0.0]]).tolist()
+    [[0.1, 1.0], [0.2, 2.0]]
     """
     check_system("plant", plant)
     n = len(plant.state_names)
