@@ -1,7 +1,7 @@
 """Searches for the structure whose rollouts of held-out rows are best.
 
 1. Nominal structures: from every base, by one term more or less at a time; the best
-   few of each round go on.
+   one of each round goes on, and the second one if it is close.
 2. Groups of outputs: those of one nominal structure, the others of another.
 3. GPs on the groups of outputs, from none and from all at once, by the change of one
    group at a time that helps most.
@@ -47,7 +47,9 @@ PAST_ROWS = MOST_PAST  # of the windows that structures are compared on
 _AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
 _JUDGED = (1, 10, 50)  # steps whose errors decide
 _PIECE = 0.02  # of the score that every piece of a structure has to earn
-_BEAM = 2  # structures that go on
+_BEAM = 2  # structures that go on, of a round
+_CLOSE = 0.02  # of the best score: where the second one goes on as well
+_FEW = 10_000  # rows of a log, up to which half of them make a worse model
 _WINDOWS = 200  # of a fold, that structures are compared on
 _CORRECTED_WINDOWS = 1200  # of a fold, that a correction is fitted to
 _CHUNKS = 6  # of held-out rollouts, each corrected by what the others say
@@ -206,6 +208,8 @@ class Search:
         while self.best is not previous_best:
             previous_best = self.best
             for structure in self._ranked(self._structures.values())[:_BEAM]:
+                if self.score(structure) > self.score(previous_best) + _CLOSE:
+                    continue
                 for neighbour in self._neighbours(structure):
                     if neighbour.key not in self._structures:
                         self._consider_nominal(neighbour, parent=structure)
@@ -610,11 +614,13 @@ class Search:
         """Fits the noise of the best structure to held-out runs.
 
         Models of half the rows err more than the one of all: here three quarters are
-        fitted to, where there are rows enough.
+        fitted to, where there are rows enough for windows, and half would be few.
         """
         try:
-            folds = self._quarters()
+            folds = self._quarters() if len(self._log) <= _FEW else []
         except DataError:
+            folds = []
+        if not folds:
             held_out = [fold.held_out for fold in self._folds]
             return fit_noise(self._models(self.best), held_out, self._steps)
         models = [

@@ -1,6 +1,8 @@
 """What wins is what is written: folds, combinations, smoothing, and what is refused."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +18,9 @@ from gpmpc.models import LogModel
 from gpmpc.models._correction import Correction
 from gpmpc.models._kinematics import Increments
 from gpmpc.models._parametric import AffineNominal
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from tests.cli.command import forked
 
 TWO = LogMapping.from_dict({"states": {"c": ["c"], "T": ["T"]}, "inputs": {"u": ["u"]}})
 STEP = 0.1
@@ -228,6 +233,28 @@ def test_a_feedback_that_fails_on_a_rival_is_told():
     fitness = judge_for_control(model, log, {"itself": model, "opposite": opposite})
     (warning,) = fitness.warnings
     assert "'opposite' unstable" in warning
+
+
+def test_a_losing_model_says_so_first_and_ends_with_code_3(tmp_path):
+    gain = np.array([-0.8, -0.9])
+    states = simulate(lambda x, u: [x[1], -x[0] + x @ gain], [1, 1], [[0.0]] * 160)
+    table = np.column_stack([STEP * np.arange(160), states, states @ gain])
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="t,c,T,u", comments="")
+    (tmp_path / "map.yaml").write_text(
+        "time: t\nrest: use\nstates: {c: [c], T: [T]}\ninputs: {u: [u]}\n"
+    )
+    done = forked(
+        *("learn", "map.yaml", "a.csv", "--steps", "5", "--points", "10"),
+        "--for-control",
+        cwd=tmp_path,
+    )
+    assert done.returncode == 3, done.stderr
+    assert "do not use this model: u follows the states" in done.stderr
+    assert "noise.input=[" in done.stdout
+    for name in ("report.md", "card.md"):
+        first = (tmp_path / "learned" / name).read_text().splitlines()[0]
+        assert first.startswith("# This model should not be used: u follows"), first
+    assert "1 / 5 steps ahead" in (tmp_path / "learned" / "report.md").read_text()
 
 
 @pytest.mark.parametrize("control", [False, True])
