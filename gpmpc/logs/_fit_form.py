@@ -7,7 +7,11 @@ import numpy as np
 
 from gpmpc._dynamics import Array
 from gpmpc.logs._fitting import PAST, NominalFit, fit_nominal
-from gpmpc.logs._linear_terms import fit_linear_term, regression_data
+from gpmpc.logs._linear_terms import (
+    fit_linear_term,
+    refine_linear_term,
+    regression_data,
+)
 from gpmpc.logs._log import Log
 from gpmpc.models._kinematics import RigidBodyKinematics
 from gpmpc.models._log_model import LogModel
@@ -44,8 +48,7 @@ def fit_from(
         model = replace(
             model, theta=start_from.theta, time_constants=start_from.time_constants
         )
-        fitted = fit_linear_term(model, log, steps)
-        return NominalFit(fitted, standard_errors=np.empty(0))
+        return NominalFit(_fit_term(model, log, steps), standard_errors=np.empty(0))
     without_memory = replace(
         model,
         memory=NO_MEMORY,
@@ -57,7 +60,15 @@ def fit_from(
     fitted = replace(
         model, theta=fit.model.theta, time_constants=fit.model.time_constants
     )
-    return replace(fit, model=fit_linear_term(fitted, log, steps))
+    return replace(fit, model=_fit_term(fitted, log, steps))
+
+
+def _fit_term(model: LogModel, log: Log, steps: int) -> LogModel:
+    """Fits the linear term of a model by its way of fitting."""
+    fitted = fit_linear_term(model, log, steps)
+    if not model.refined:
+        return fitted
+    return refine_linear_term(fitted, log, steps)
 
 
 def _has_equal_nominal_part(one: LogModel, other: LogModel) -> bool:

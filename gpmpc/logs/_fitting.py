@@ -120,7 +120,7 @@ class _RolloutResiduals:
         self._steps = steps
         spread = np.geomspace(1, steps, _COUNTED_STEPS)
         self._counted = np.unique(spread.round().astype(int))
-        self._scale = _errors_at_rest(windows, self._counted)
+        self._scale = errors_at_rest(windows, self._counted)
 
     def __call__(self, theta: Array) -> Array:
         """Computes the residuals of a parameter vector (P,), as a vector."""
@@ -153,7 +153,7 @@ class _RolloutResiduals:
         return slopes.reshape(len(theta), -1).T
 
 
-def _errors_at_rest(windows: Windows, steps: np.ndarray) -> Array:
+def errors_at_rest(windows: Windows, steps: np.ndarray) -> Array:
     """Computes the mean errors (steps, e) of a state that does not move.
 
     They are the same for all entries of a group, and never zero.

@@ -4,6 +4,10 @@ One step ahead the smallest penalty looks best, since noisy, smoothed and mistim
 explain each other. Many steps ahead it may be useless. So each group of outputs gets
 the penalty with which the rollouts of rows that were left out are best: two halves of
 the log, each of which is rolled out by what the other one taught.
+
+Of noisy rows even the best such fit is biased (errors in variables). ``refine`` goes on
+from it to the weights whose own rollouts are best, by Gauss-Newton steps (the output
+error of Ljung, 1999, section 3.3).
 """
 
 from collections.abc import Sequence
@@ -12,9 +16,11 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
+from gpmpc.logs._fitting import errors_at_rest
 from gpmpc.logs._log import Log, LogRun
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._windows import Windows
@@ -26,6 +32,17 @@ _WINDOWS = 100  # of a half, whose rollouts choose
 _JUDGED = (1, 10, 50)  # steps of them
 _BLOCKS = 8  # of a log of few runs, half of which are left out
 _FEW_RUNS = 4
+_MOST_REFINED = 250  # weights of a term that is refined
+_FEW_WEIGHTS = 40  # those of a term for which long rollouts cost little
+_STRETCH = 3  # times as long, at most
+_ROWS_A_STEP = 20  # of a log, for each step of these
+_ROLLED_ROWS = 450_000  # of one Jacobian: weights times windows times steps
+_REFINED_WINDOWS = 150
+_COUNTED_STEPS = 12  # of a rollout, whose errors count
+_PRIOR = 0.1  # weight of the ridge regression, in the mean squared error
+_EVALUATIONS = 10
+_DIFFERENCE = 1e-5
+_LARGEST_ERROR = 1e3
 
 
 class Moments(NamedTuple):
@@ -70,6 +87,92 @@ def fit_linear_term(model: LogModel, log: Log, steps: int) -> LogModel:
     """
     penalties = _choose_penalties(model, log, steps)
     return replace(model, weights=_moments(model, log).weights(penalties))
+
+
+def refine_linear_term(model: LogModel, log: Log, steps: int) -> LogModel:
+    """Moves the weights of a fitted linear term to where rollouts are best.
+
+    Args:
+        model: With its weights.
+        log: The data.
+        steps: Of the rollouts; those of few weights are longer where the log allows.
+    """
+    if model.weights.size > _MOST_REFINED:
+        return model
+    errors = _RolloutErrors.of(model, log, steps)
+    with np.errstate(over="ignore", invalid="ignore"):
+        solution = least_squares(
+            errors,
+            np.zeros(model.weights.size),
+            errors.jacobian,
+            loss="soft_l1",
+            xtol=1e-4,
+            ftol=1e-4,
+            max_nfev=_EVALUATIONS,
+        )
+    return errors.model_at(solution.x)
+
+
+@dataclass(frozen=True)
+class _RolloutErrors:
+    """Errors of rollouts as a function of changes of the weights, without units."""
+
+    model: LogModel
+    windows: Windows
+    steps: np.ndarray  # whose errors count
+    scale: Array  # of the errors (steps, e)
+    unit: Array  # of the changes (o, r): each moves the outputs by as much
+
+    @classmethod
+    def of(cls, model: LogModel, log: Log, steps: int) -> "_RolloutErrors":
+        """Chooses windows, as many and as long as the weights allow."""
+        longest = max(b - a for run in log for a, b in run.pieces) - model.past - 1
+        steps = min(steps, longest)
+        if model.weights.size <= _FEW_WEIGHTS:
+            affordable = min(len(log) // _ROWS_A_STEP, longest // 2)
+            steps = int(np.clip(affordable, steps, _STRETCH * steps))
+        count = _ROLLED_ROWS // (model.weights.size * steps)
+        windows = log.windows(
+            steps, past=model.past, most=int(np.clip(count, 40, _REFINED_WINDOWS))
+        )
+        counted = np.geomspace(1, steps, _COUNTED_STEPS).round().astype(int)
+        counted = np.unique(counted)
+        deviation = _moments(model, log).deviation
+        deviation = np.where(np.isfinite(deviation), deviation, np.inf)
+        moved = np.where(np.isfinite(deviation), model.weights * deviation, 0.0)
+        size = np.linalg.norm(moved, axis=1, keepdims=True) + 1e-12
+        return cls(
+            model=model,
+            windows=windows,
+            steps=counted,
+            scale=errors_at_rest(windows, counted),
+            unit=size / deviation,
+        )
+
+    def model_at(self, change: Array) -> LogModel:
+        """Returns the model with changed weights (o r,), or many of them (T, o r)."""
+        shape = (*change.shape[:-1], *self.unit.shape)
+        weights = self.model.weights + change.reshape(shape) * self.unit
+        return replace(self.model, weights=weights)
+
+    def __call__(self, change: Array) -> Array:
+        """Computes the residuals of a change (o r,), as a vector."""
+        return self._of_changes(change[None])[0]
+
+    def _of_changes(self, changes: Array) -> Array:
+        """Computes the residuals (T, R) of changes (T, P), each with its prior."""
+        model = self.model_at(changes)
+        errors = model.rollout_errors(self.windows, self.steps) / self.scale
+        errors = np.clip(errors, -_LARGEST_ERROR, _LARGEST_ERROR)
+        errors = errors.reshape(len(changes), -1)
+        weight = np.sqrt(_PRIOR * errors.shape[1] / changes.shape[1])
+        return np.concatenate([errors, weight * changes], axis=1)
+
+    def jacobian(self, change: Array) -> Array:
+        """Computes the derivatives of the residuals (R, P) by forward differences."""
+        displaced = change + _DIFFERENCE * np.eye(len(change))
+        residuals = self._of_changes(np.concatenate([displaced, change[None]]))
+        return ((residuals[:-1] - residuals[-1]) / _DIFFERENCE).T
 
 
 def _choose_penalties(model: LogModel, log: Log, steps: int) -> Array:

@@ -43,6 +43,7 @@ _MEMORIES = {
         "3 past rows and means",
         Memory(3, (0.75, 0.9, 0.95), (0.0, 0.5, 0.8, 0.95)),
     ),
+    "rows2": ("2 past rows", Memory(2)),
     "rows8": ("8 past rows", Memory(8, (), (0.0, 0.5, 0.8, 0.95))),
 }
 # Rows before a start that any structure needs.
@@ -218,8 +219,8 @@ def additions(structure: Structure) -> tuple[Addition, ...]:
     )
     if isinstance(structure.model.nominal, MultirotorNominal):
         alone = _alone_additions(structure.model)
-        return (*_MULTIROTOR_ADDITIONS, *_MEMORY_ADDITIONS, lags, *alone)
-    return (*_AFFINE_ADDITIONS, *_MEMORY_ADDITIONS, lags)
+        return (*_MULTIROTOR_ADDITIONS, *_BODY_ADDITIONS, lags, *alone)
+    return (*_AFFINE_ADDITIONS, *_MEMORY_ADDITIONS, lags, _REFINED)
 
 
 def _median_voltage(log: Log) -> float:
@@ -246,6 +247,25 @@ def _with_memory(memory: Memory) -> Callable[[LogModel], LogModel | None]:
 _MEMORY_ADDITIONS = tuple(
     Addition(key, words, _with_memory(memory), for_control=False)
     for key, (words, memory) in _MEMORIES.items()
+)
+
+
+# Few rows are enough of few signals alone.
+_BODY_ADDITIONS = tuple(one for one in _MEMORY_ADDITIONS if one.key != "rows2")
+
+
+def _with_refined_term(model: LogModel) -> LogModel | None:
+    is_small = isinstance(model.kinematics, Increments)
+    if model.memory.empty or model.refined or not is_small:
+        return None
+    return replace(model, refined=True)
+
+
+_REFINED = Addition(
+    key="refined",
+    words="fitted on rollouts",
+    extend=_with_refined_term,
+    for_control=False,
 )
 
 

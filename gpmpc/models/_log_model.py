@@ -31,7 +31,7 @@ from gpmpc.models._roll_out import iterate
 from gpmpc.models._windows import Windows
 
 DIVERGED = 1e9  # error of a rollout that is not finite
-_LAG_ROWS = 20  # from which the state of first-order lags is known
+_LAG_ROWS = 40  # from which the state of first-order lags is known
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,8 @@ class LogModel:
     weights: Array = field(default_factory=lambda: np.empty((0, 0)))
     #: outputs to which the nominal part does not add
     without_nominal: tuple[int, ...] = ()
+    #: whether W is fitted to rollouts, beyond one step; predictions do not need it
+    refined: bool = False
 
     def __post_init__(self) -> None:
         o = len(self.kinematics.output_names)

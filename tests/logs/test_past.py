@@ -1,0 +1,164 @@
+"""Models of logs that remember past rows, and inputs that act through lags."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gpmpc.exceptions import SettingError
+from gpmpc.logs import (
+    Log,
+    LogMapping,
+    fit_nominal,
+    learn,
+    load_learned,
+    save_learned,
+)
+from gpmpc.logs._fit_form import fit_from
+from gpmpc.logs._linear_terms import fit_linear_term, refine_linear_term
+from gpmpc.logs._log import LogRun
+from gpmpc.models import LogModel
+from gpmpc.models._kinematics import Increments
+from gpmpc.models._memory import Memory
+from gpmpc.models._parametric import AffineNominal
+
+ROWS = Memory(rows=3, decays=(0.8,), output_decays=(0.5,))
+
+
+def as_log(states, inputs, time_step, names=("y",)):
+    """A log of one run."""
+    mapping = LogMapping.from_dict(
+        {"states": {name: [name] for name in names}, "inputs": {"u": ["u"]}}
+    )
+    time = time_step * np.arange(len(states))
+    run = LogRun("run", time, states, inputs, np.empty((len(states), 0)))
+    return Log(mapping, time_step, (run,))
+
+
+def tanks(seed, rows=700, noise=0.01):
+    """Two tanks one above the other, of which the lower level alone is measured."""
+    rng = np.random.default_rng(seed)
+    u = np.clip(1.5 + np.repeat(rng.normal(size=rows // 20), 20), 0, 4)
+    upper = lower = 2.0
+    levels = []
+    for pumped in u:
+        levels.append(lower)
+        inflow = 0.2 * np.sqrt(upper)
+        upper = max(upper + 0.2 * pumped - inflow, 0.0)
+        lower = max(lower + inflow - 0.2 * np.sqrt(lower), 0.0)
+    measured = np.array(levels) + noise * rng.normal(size=rows)
+    return as_log(measured[:, None], u[:, None], time_step=1.0)
+
+
+def arx_error(train, windows, order, steps):
+    """Mean error of rollouts of the best linear model of so many rows one step ahead."""
+    run = train.runs[0]
+    y = run.states[:, 0]
+    u = run.inputs[:, 0]
+    rows = range(order, len(y))
+    regressors = np.array([np.r_[y[k - order : k], u[k - order : k], 1] for k in rows])
+    weights = np.linalg.lstsq(regressors, y[order:], rcond=None)[0]
+    past = windows.past
+    levels = windows.states[:, past - order + 1 : past + 1, 0]
+    one = np.ones((len(levels), 1))
+    for k in range(steps):
+        first = past - order + 1 + k
+        inputs = windows.inputs[:, first : first + order, 0]
+        seen = np.hstack([levels[:, -order:], inputs, one])
+        levels = np.hstack([levels, (seen @ weights)[:, None]])
+    return np.abs(levels[:, -1] - windows.states[:, past + steps, 0]).mean()
+
+
+def test_outputs_alone_are_learned_with_their_past(tmp_path):
+    train = tanks(0)
+    held_out = tanks(1)
+    learned = learn(train, points=20, steps=40)
+    model = learned.model
+    assert not model.memory.empty
+    windows = held_out.windows(40, past=model.past)
+    dynamics = replace(model, correction=None)
+    for steps in (10, 40):
+        error = np.abs(dynamics.rollout_errors(windows, [steps])).mean()
+        linear = [arx_error(train, windows, order, steps) for order in (1, 2, 4, 8)]
+        assert error < 1.02 * min(linear)
+    save_learned(learned, tmp_path / "model.safetensors")
+    loaded = load_learned(tmp_path / "model.safetensors").model
+    np.testing.assert_allclose(loaded.rollout(windows), model.rollout(windows))
+
+
+def with_memory(log, memory=ROWS):
+    """A linear model of past rows, not fitted yet."""
+    kinematics = Increments(log.space)
+    outputs = len(kinematics.output_names)
+    return LogModel(
+        kinematics=kinematics,
+        nominal=AffineNominal(kinematics, fitted=False),
+        theta=np.empty(0),
+        history=(0,) * outputs,
+        memory=memory,
+    )
+
+
+def test_noisy_rows_are_fitted_better_on_rollouts_than_one_step_ahead():
+    train = tanks(0, noise=0.05)
+    model = fit_linear_term(with_memory(train, Memory(rows=2)), train, steps=40)
+    refined = refine_linear_term(model, train, steps=40)
+    windows = tanks(1, noise=0.0).windows(40, past=model.past)
+    errors = [np.abs(one.rollout_errors(windows)).mean() for one in (model, refined)]
+    assert errors[1] < 0.9 * errors[0]
+
+
+def test_a_memory_is_what_a_rollout_over_measured_rows_leaves():
+    log = tanks(0, rows=60, noise=0.0)
+    model = fit_linear_term(with_memory(tanks(0)), tanks(0), steps=40)
+    windows = log.windows(1, past=model.past)
+    features, residuals = model.nominal_residuals(windows, slice(0, model.past))
+    memory = np.tile(features[:, 0], (1, 4))
+    memory = np.hstack([memory, residuals[:, 0]])
+    for k in range(model.past):
+        memory = model.memory.step(memory, features[:, k], residuals[:, k])
+    filled = model.memory.begin(features, residuals)
+    np.testing.assert_allclose(filled, memory)
+    np.testing.assert_allclose(model.parts(model.recall(windows), 1).memory, memory)
+
+
+@pytest.mark.parametrize("time_constant", [0.02, 0.1])
+def test_first_order_lags_come_back(time_constant):
+    dt = 0.01
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.normal(size=150), 20)[:, None]
+    rate = acting = 0.0
+    rates = []
+    for command in u[:, 0]:
+        rates.append(rate)
+        for _ in range(20):  # finer than the log
+            acting += (command - acting) * dt / 20 / time_constant
+            rate += (acting - rate) * dt / 20
+    log = as_log(np.array(rates)[:, None], u, dt)
+    kinematics = Increments(log.space)
+    affine = AffineNominal(kinematics)
+    model = LogModel(kinematics, affine, np.empty(0), (0,), time_constants=np.zeros(1))
+    (fitted,) = fit_from(model, model, log, steps=50).model.time_constants
+    assert abs(fitted - time_constant) < 0.3 * time_constant
+    named = replace(model, nominal=Pull())
+    fit = fit_nominal(named, None, log, steps=50).model
+    np.testing.assert_allclose(fit.time_constants, time_constant, rtol=0.1)
+    np.testing.assert_allclose(fit.theta, 1.0, rtol=0.05)
+
+
+class Pull:
+    """A state that an input pulls at, with a gain."""
+
+    parameter_names = ("gain",)
+    start = np.array([0.5])
+
+    def outputs(self, theta, states, inputs, context):
+        (gain,) = theta
+        return np.asarray(gain)[..., None] * inputs - states
+
+
+def test_misuse_of_a_memory_is_named():
+    with pytest.raises(SettingError, match=r"decays: must be within \[0, 1\)"):
+        Memory(decays=(1.0,))
+    with pytest.raises(SettingError, match="must be zero beside a memory"):
+        replace(with_memory(tanks(0, rows=60)), history=(20,))
