@@ -346,7 +346,9 @@ class Slurm:
         own = _OWN_ERROR.findall(log)
         if own:
             return f"failed: {own[-1]}"
-        return f"died, and nobody says why; its log ends: {_one_line(log)[-200:]!r}"
+        how = f" ({job.reason})" if job and job.reason else ""
+        told = f"; its log ends: {_one_line(log)[-200:]!r}" if log.strip() else ""
+        return f"died, and nobody says why{how}{told}"
 
 
 def _cause(job: _Job | None, log: str | None) -> Cause | None:
