@@ -1,0 +1,1 @@
+"""Robots from an empty folder, each one script by the README's road."""
