@@ -15,10 +15,11 @@ import hashlib
 import itertools
 import json
 from argparse import Namespace
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import hydra
 from rich.console import Console
@@ -32,17 +33,21 @@ from gpmpc.cli._experiment import experiment_of, plain_settings
 from gpmpc.cli._flying import Flying
 from gpmpc.cli._launchers import launcher_of
 from gpmpc.cli._overrides import choices, combinations
-from gpmpc.cli._run import warning_of
 from gpmpc.cli._settings import folder_of, write_files
 from gpmpc.cli._terminal import print_error, progress_bar
 from gpmpc.exceptions import check_number
+from gpmpc.studies._index import RunIndex
 from gpmpc.studies._run_folder import (
+    METRICS,
     PLAN,
     RunFolder,
     RunState,
     folder_name,
     of_other_code,
 )
+from gpmpc.studies._run_record import DAMAGE, warning_of
+
+_LOOKS = 1000  # at folders whenever the bar is drawn
 
 
 class JobOutcome(NamedTuple):
@@ -67,6 +72,7 @@ class Sweep:
         self.console = console
         self._composer = Composer(name, self.config)
         self._examples = Examples()
+        self._index = RunIndex(self.tree)
         check_number("retries", self.config.retries, least=0, whole=True)
         self._launcher = launcher_of(self.config, self.tree)
         self._chunking = Chunking(self.config.chunk, self._launcher.workers)
@@ -111,16 +117,31 @@ class Sweep:
         ):
             for job in finished:
                 self._check_finished(job)
+        self._index.write()
 
     def _check_finished(self, job: Job) -> None:
-        config = job.settings.config()
-        result = job.folder.result(plain_settings(config, job.settings.options))
-        warning = warning_of(result)
-        if warning is not None:
+        """Compares a run's settings, once: the index says with what it was compared."""
+        asked = job.settings.fingerprint()
+        path = job.folder.path / METRICS
+        found, record = self._index.asked(path)
+        if record is not None and asked is not None and found == asked:
+            warning = record.warning
+            other_code = "" if record.is_of_this_code() else record.made_by
+        else:
+            config = job.settings.config()
+            result = job.folder.result(plain_settings(config, job.settings.options))
+            warning = warning_of(result)
+            other_code = of_other_code(result)
+            self._add_to_index(path, result, asked)
+        if warning:
             self.warnings[job.folder.path] = warning
-        other_code = of_other_code(result)
         if other_code:
             self.of_other_code[job.folder.path] = other_code
+
+    def _add_to_index(self, path: Path, result: Any, asked: str | None) -> None:
+        """Keeps what a report shows of a run, unless it is of an older version."""
+        with suppress(*DAMAGE):
+            self._index.add(path, result, asked)
 
     def fly(self, jobs: Sequence[Job]) -> list[JobOutcome]:
         """Flies the runs that are not finished; returns the outcome of each of those.
@@ -146,11 +167,14 @@ class Sweep:
         return outcomes
 
     def _outcome(self, job: Job, state: RunState) -> JobOutcome:
-        """Reads how a run ended; its warning is noted."""
+        """Reads how a run ended, for the index, too; its warning is noted."""
         folder = self.tree / job.folder.path.name
         if state is RunState.FAILED:
             return JobOutcome(str(folder), job.folder.error())
-        warning = warning_of(job.folder.result())
+        result = job.folder.result()
+        self._add_to_index(folder / METRICS, result, job.settings.fingerprint())
+        self._index.write()
+        warning = warning_of(result)
         if warning is not None:
             self.warnings[folder] = warning
         return JobOutcome(str(folder))
@@ -164,11 +188,11 @@ class Sweep:
         Yields:
             A function that names the bar.
         """
-        with progress_bar(
-            self.console, lambda: sum(job.done for job in [*jobs])
-        ) as bar:
+        ends = _Ends(jobs)
+        with progress_bar(self.console, ends.count) as bar:
             task = bar.add_task("flying", total=total)
             yield lambda text: bar.update(task, description=text)
+            ends.look_at_all()
 
     def print_other_code(self) -> None:
         """Prints how many finished runs were flown by other code, where any was."""
@@ -202,6 +226,40 @@ class Sweep:
         """Prints the finished runs that were lost, or suspicious at their end."""
         for folder, warning in sorted(self.warnings.items()):
             print_error(f"{folder}: {warning}")
+
+
+class _Ends:
+    """Counts the runs that have ended, with a few looks at a time.
+
+    Args:
+        jobs: All runs; others may be added behind them.
+    """
+
+    def __init__(self, jobs: Sequence[Job]):
+        self._jobs = jobs
+        self._taken = 0  # of the jobs
+        self._open: deque[Job] = deque()
+        self._ended = 0
+
+    def count(self) -> int:
+        """Returns how many are known to have ended; looks at some of the others."""
+        self._look(_LOOKS)
+        return self._ended
+
+    def look_at_all(self) -> None:
+        """Looks at every run that is not known to have ended."""
+        self._look(len(self._jobs))
+
+    def _look(self, most: int) -> None:
+        added = self._jobs[self._taken :]
+        self._open.extend(added)
+        self._taken += len(added)
+        for _ in range(min(most, len(self._open))):
+            job = self._open.popleft()
+            if job.done:
+                self._ended += 1
+            else:
+                self._open.append(job)
 
 
 def sweep(arguments: Namespace) -> Result:

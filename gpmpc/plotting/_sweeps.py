@@ -17,6 +17,8 @@ from gpmpc.plotting._style import (
     styled,
 )
 
+_MOST_TICKS = 40  # on the axis of the variable
+
 
 @dataclass(frozen=True)
 class Series:
@@ -51,7 +53,7 @@ def over_variable(
     draw_quartiles(axis, lines, positions)
     axis.set_title(label, fontsize="medium")
     axis.set_xlabel(clipped(title, 50))
-    if max(map(len, positions)) * len(positions) > 40:
+    if max(map(len, positions)) * min(len(positions), _MOST_TICKS) > 40:
         axis.tick_params(axis="x", labelrotation=30)
     values = [value for line in lines for group in line.values for value in group]
     low = min(values, default=0)
@@ -83,9 +85,10 @@ def draw_quartiles(
         _draw_values(axis, line, centres, scale, colour, width=0.3 * distance)
     if scale.is_logarithmic:
         axis.set_xscale("log")
+    every = -(-len(positions) // _MOST_TICKS)  # rounded up
     axis.set_xticks(
-        scale.to_axis(scale.coordinates),
-        [clipped(position, 24) for position in positions],
+        scale.to_axis(scale.coordinates[::every]),
+        [clipped(position, 24) for position in positions[::every]],
     )
     axis.xaxis.set_minor_locator(NullLocator())
     axis.set_xlim(*scale.limits())
@@ -185,18 +188,19 @@ def _draw_values(
     width: float,
 ) -> None:
     """Draws every value as a dot, those of a position side by side."""
+    coordinates = [np.empty(0)]
     for centre, group in zip(centres, line.values, strict=True):
         fractions = (np.arange(len(group)) + 0.5) / max(len(group), 1)  # 0 to 1
-        offsets = width * (fractions * 2 - 1)
-        axis.plot(
-            scale.to_axis(centre + offsets),
-            group,
-            ".",
-            color=colour,
-            alpha=0.45,
-            markersize=5,
-            mew=0,
-        )
+        coordinates.append(centre + width * (fractions * 2 - 1))
+    axis.plot(
+        scale.to_axis(np.concatenate(coordinates)),
+        [value for group in line.values for value in group],
+        ".",
+        color=colour,
+        alpha=0.45,
+        markersize=5,
+        mew=0,
+    )
 
 
 @styled

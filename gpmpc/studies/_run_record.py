@@ -12,7 +12,7 @@ from pathlib import Path
 from sys import intern
 from typing import Any, NamedTuple
 
-from gpmpc._provenance import flattened
+from gpmpc._provenance import code_fingerprint_or_none, flattened, own_code
 from gpmpc.studies._document import plain_text
 from gpmpc.studies._run_folder import ERROR, describe_code
 
@@ -129,6 +129,14 @@ class RunRecord:
             return plain_text(str(value))
         return ""
 
+    def is_of_this_code(self) -> bool:
+        """Whether the code that flew it is that which would fly it now."""
+        targets = [
+            {"_target_": value} if key.endswith("_target_") else value
+            for key, value in self.settings.items()
+        ]
+        return self.code == _code_text(code_fingerprint_or_none(), own_code(targets))
+
     def row(self) -> dict[str, Any]:
         """Returns its columns in ``Report.runs`` but for cell and seed."""
         columns = {name: getattr(self, name) for name in _COLUMNS}
@@ -227,7 +235,11 @@ def _code(content: Result) -> str:
     provenance = content.get("provenance") or {}
     of_gpmpc = provenance.get("code") or describe_code(provenance)
     of_user = provenance.get("own_code") or {}
-    return plain_text(json.dumps([of_gpmpc, of_user], sort_keys=True))
+    return plain_text(_code_text(of_gpmpc, of_user))
+
+
+def _code_text(of_gpmpc: str | None, of_user: Mapping[str, str]) -> str:
+    return json.dumps([of_gpmpc, of_user], sort_keys=True)
 
 
 def parsed(choices: Any) -> Choices:

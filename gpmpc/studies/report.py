@@ -49,6 +49,7 @@ _SHORT_LABELS = {
 # What a value means, where a setting calls it otherwise.
 _WORDS = {("data.size", "null"): "all"}
 _QUARTILES = ("q25", "median", "q75")
+_MOST_TERMINAL_ROWS = 500
 _MOST_LINES = 8  # in a figure; what is varied besides is pooled
 _LEGEND = (
     "Median [first to third quartile] over the seeds. In figures, every run is a dot."
@@ -89,14 +90,18 @@ def report_document(
 def terminal_table(report: Report) -> Table:
     """Returns the table with short headers: median, and the quartiles below it.
 
-    What is zero everywhere is left out.
+    What is zero everywhere is left out, and the end of a very long table.
     """
     measures = [name for name in _measures_above_zero(report) if name in _SHORT_LABELS]
     header = [name.replace(".", ".\n") for name in _variables(report)]
     header.append("seeds")
     for name in measures:
         header.append(f"{_SHORT_LABELS[name]}\n[{_unit(report.measures[name])}")
-    return Table(header, _table(report, measures).rows, _counts(report))
+    rows = _table(report, measures).rows
+    title = _counts(report)
+    if len(rows) > _MOST_TERMINAL_ROWS:
+        title += f"; the first {_MOST_TERMINAL_ROWS} of {len(rows)} cells"
+    return Table(header, rows[:_MOST_TERMINAL_ROWS], title)
 
 
 def notes(report: Report) -> dict[str, list[str]]:
@@ -166,9 +171,11 @@ def _origins(report: Report, key: str) -> list[str]:
 
 def _links(report: Report, folder: Path) -> dict[str, str]:
     """Returns the runs as seen from ``folder``, by their name in the tree."""
+    parents = {run.folder.parent for run in report.there}
+    seen = {each: os.path.relpath(each.resolve(), folder) for each in parents}
     return {
-        plain_text(str(run.folder.relative_to(report.tree))): os.path.relpath(
-            run.folder.resolve(), folder
+        plain_text(str(run.folder.relative_to(report.tree))): os.path.join(
+            seen[run.folder.parent], run.folder.name
         )
         for run in report.there
     }
@@ -216,11 +223,20 @@ def _quartiles(report: Report, measures: Sequence[str]) -> np.ndarray:
     NaN where no run has a number.
     """
     quartiles = np.full((len(report.cells), len(measures), 3), np.nan)
-    for cell, runs in report.runs.groupby("cell"):
-        for j, name in enumerate(measures):
-            values = runs[name].dropna()
-            if len(values):
-                quartiles[cell, j] = np.quantile(values, [0.25, 0.5, 0.75])
+    for j, name in enumerate(measures):
+        values = report.runs[name].dropna()
+        cells = report.runs.cell[values.index].to_numpy()
+        order = np.argsort(cells, kind="stable")
+        sorted_values = values.to_numpy()[order]
+        cells, starts, counts = np.unique(
+            cells[order], return_index=True, return_counts=True
+        )
+        for count in np.unique(counts):  # cells with as many numbers are one array
+            of_count = counts == count
+            rows = starts[of_count, np.newaxis] + np.arange(count)
+            quartiles[cells[of_count], j] = np.quantile(
+                sorted_values[rows], [0.25, 0.5, 0.75], axis=1
+            ).T
     return quartiles
 
 
@@ -302,16 +318,13 @@ def _figure(report: Report, index: int, measure: str) -> bytes:
     """Draws a measure over the variable of an index."""
     positions = sorted({cell[index] for cell in report.cells}, key=in_order)
     values = report.runs[measure].dropna()
-    cells = report.runs.cell[values.index]
-    position_of_run = cells.map(lambda cell: report.cells[cell][index])
+    values_of_cell = values.groupby(report.runs.cell[values.index]).apply(list)
     series = []
     for label, cells_of_line in _lines(report, index).items():
-        in_line = cells.isin(cells_of_line)
-        by_position = [
-            values[in_line & (position_of_run == position)].tolist()
-            for position in positions
-        ]
-        series.append(Series(figure_label(label), by_position))
+        by_position: dict[str, list[float]] = {position: [] for position in positions}
+        for cell in cells_of_line:
+            by_position[report.cells[cell][index]] += values_of_cell.get(cell, [])
+        series.append(Series(figure_label(label), [*by_position.values()]))
     figure = over_variable(
         figure_label(report.variables[index]),
         [
