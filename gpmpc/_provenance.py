@@ -31,6 +31,8 @@ _NO_SOURCES = ("__pycache__", "conf")  # folders
 # Of a user's own package: tables may stand beside the code that has written them.
 _OWN_SOURCES = (".py", ".xml")
 
+_LEAVES = (str, int, float, list, type(None))  # of plain data
+
 _PACKAGES = ("gpmpc", "torch", "gpytorch", "numpy", "scipy", "casadi", "hydra-core")
 
 
@@ -222,15 +224,20 @@ def _imported_packages(path: Path) -> list[str]:
     return [name.partition(".")[0] for name in names]
 
 
-def flattened(data: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flattened(data: Mapping[str, Any]) -> dict[str, Any]:
     """Returns nested data as one dictionary, keys dotted."""
     leaves: dict[str, Any] = {}
-    for key, value in data.items():
-        if isinstance(value, Mapping):
-            leaves |= flattened(value, f"{prefix}{key}.")
-        else:
-            leaves[f"{prefix}{key}"] = value
+    _flatten(data, "", leaves)
     return leaves
+
+
+def _flatten(data: Mapping[str, Any], prefix: str, leaves: dict[str, Any]) -> None:
+    for key, value in data.items():
+        # First what is decided quickly: most are.
+        if isinstance(value, _LEAVES) or not isinstance(value, Mapping):
+            leaves[f"{prefix}{key}"] = value
+        else:
+            _flatten(value, f"{prefix}{key}.", leaves)
 
 
 def environment() -> dict[str, str | None]:

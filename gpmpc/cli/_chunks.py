@@ -10,6 +10,7 @@ first ones were short ones, a chunk ends early, and what it leaves is grouped ag
 """
 
 import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import median
@@ -26,6 +27,7 @@ _WORK = 60.0  # of a chunk [s]
 _MOST_WORK = 120.0  # behind which a chunk begins no other run [s]
 _FIRST = 2  # runs a process in the first round; the first one loads what is compiled
 _MOST_FIRST = 8  # processes in the first round
+_MEASURED = 50  # runs, the last ones, that tell how long others take
 _TURNS = 4  # chunks a process, at least, so that all of them end at about one time
 
 
@@ -121,8 +123,9 @@ class Chunking:
             check_number("chunk", size, least=1, whole=True)
         self._size = None if isinstance(size, str) else size
         self._workers = workers
-        self._seconds: list[float] = []  # of runs, the first in a process left out
-        self._first_seconds: list[float] = []
+        # Of the last runs, the first in a process left out.
+        self._seconds: deque[float] = deque(maxlen=_MEASURED)
+        self._first_seconds: deque[float] = deque(maxlen=_MEASURED)
         self._first_in_process: set[RunFolder] = set()
 
     def measure(self, job: Job) -> None:

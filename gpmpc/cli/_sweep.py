@@ -47,6 +47,7 @@ from gpmpc.studies._run_folder import (
 )
 from gpmpc.studies._run_record import DAMAGE, warning_of
 
+_MEASURED = 20  # finished runs whose times tell how long others take
 _LOOKS = 1000  # at folders whenever the bar is drawn
 
 
@@ -118,6 +119,8 @@ class Sweep:
             for job in finished:
                 self._check_finished(job)
         self._index.write()
+        for job in finished[-_MEASURED:]:
+            self._chunking.measure(job)
 
     def _check_finished(self, job: Job) -> None:
         """Compares a run's settings, once: the index says with what it was compared."""

@@ -34,6 +34,7 @@ from gpmpc.studies._run_record import (
 )
 
 INDEX = "index.jsonl"
+_MOST_UNWRITTEN = 500  # lines
 _STATES = {METRICS: "finished", ERROR: "failed"}
 _TEXTS = ("unit", "code", "lost", "suspicious", "error", "warning", "made_by")
 
@@ -64,7 +65,7 @@ class RunIndex:
         self._bases: dict[str, dict[str, Any]] = {}  # settings
         self._base_of_keys: dict[tuple[str, ...], str] = {}
         self._lines: dict[str, _Line] = {}  # by name of the run's folder
-        self._unwritten: list[dict[str, Any]] = []
+        self._unwritten: list[str] = []
         self._written_bases: set[str] = set()
         self._origins: dict[tuple[tuple[str, str], ...], dict[str, str]] = {}
         self._read()
@@ -83,7 +84,7 @@ class RunIndex:
     def add(
         self, path: Path, content: Any = None, asked: str | None = None
     ) -> RunRecord:
-        """Adds a run; ``write`` puts it into the file.
+        """Adds a run; ``write`` puts it into the file, or one that follows does.
 
         Args:
             path: Its ``metrics.json`` or ``error.json``.
@@ -102,8 +103,11 @@ class RunIndex:
         base = self._base_of_keys[tuple(record.settings)]
         if base not in self._written_bases:
             self._written_bases.add(base)
-            self._unwritten.append({"base": base, "settings": self._bases[base]})
-        self._unwritten.append(_content(path.parent.name, base, line))
+            content_of_base = {"base": base, "settings": self._bases[base]}
+            self._unwritten.append(json.dumps(content_of_base))
+        self._unwritten.append(json.dumps(_content(path.parent.name, base, line)))
+        if len(self._unwritten) > _MOST_UNWRITTEN:
+            self.write()
         return record
 
     def asked(self, path: Path) -> tuple[str | None, RunRecord | None]:
@@ -115,8 +119,7 @@ class RunIndex:
         """Appends what was added; where that is not possible, nothing is lost."""
         if not self._unwritten:
             return
-        lines = [json.dumps(content) for content in self._unwritten]
-        text = "\n".join([*lines, ""])
+        text = "\n".join([*self._unwritten, ""])
         self._unwritten.clear()
         with suppress(OSError):
             file = os.open(self._path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)

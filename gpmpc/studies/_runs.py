@@ -166,7 +166,7 @@ def _read_files(tree: Path) -> _Files:
     for path in paths.plans:
         try:
             planned_runs = _read_json(path)["runs"]
-            files.plans += [parsed(choices) for choices in planned_runs]
+            files.plans += map(parsed, planned_runs)
         except DAMAGE as error:
             files.skipped.append(_why_skipped(path, "sweep", error))
             files.unread_folders.add(path.parent.name)
@@ -183,18 +183,24 @@ class _Paths:
     @classmethod
     def below(cls, tree: Path) -> "_Paths":
         """Looks for them; the metrics of a run stand for an older error."""
-        results: dict[str, Path] = {}  # by folder
-        plans = []
-        folders = sorted(os.walk(tree), key=lambda walked: walked[0].split(os.sep))
-        for name in (ERROR, METRICS):
-            for folder, _, files in folders:
+        results: dict[str, list[str]] = {ERROR: [], METRICS: []}  # folders
+        plans: list[Path] = []
+        for folder, _, files in os.walk(tree):
+            for name, folders in results.items():
                 if name in files:
-                    results[folder] = Path(folder, name)
-        for folder, _, files in folders:
-            for file in sorted(files):
-                if file.startswith(PLAN) and file.endswith(".json"):
-                    plans.append(Path(folder, file))
-        return cls([*results.values()], plans)
+                    folders.append(folder)
+            plans += [
+                Path(folder, file)
+                for file in files
+                if file.startswith(PLAN) and file.endswith(".json")
+            ]
+        names: dict[str, str] = {}  # of the result, by folder
+        for name, folders in results.items():
+            folders.sort(key=lambda folder: folder.split(os.sep))
+            names |= dict.fromkeys(folders, name)
+        return cls(
+            [Path(folder, name) for folder, name in names.items()], sorted(plans)
+        )
 
 
 def _read_json(path: Path) -> Any:
@@ -210,15 +216,19 @@ def _why_skipped(path: Path, writer: str, error: Exception) -> str:
 
 def _not_there(files: _Files) -> list[RunRecord]:
     """Returns the runs that were planned and are missing or cannot be read."""
-    there = {frozenset(run.choices.items()) for run in files.runs}
+    there = {_name_of(run.choices) for run in files.runs}
     absent = []
     for choices in files.plans:
-        if frozenset(choices.items()) in there:
-            continue
-        name = folder_name(_overrides(choices))
-        state = "skipped" if name in files.unread_folders else "missing"
-        absent.append(RunRecord(choices, state))
+        name = _name_of(choices)
+        if name not in there:
+            state = "skipped" if name in files.unread_folders else "missing"
+            absent.append(RunRecord(choices, state))
     return absent
+
+
+def _name_of(choices: Choices) -> str:
+    """Returns the name of the folder of a run; other choices have another one."""
+    return folder_name(_overrides(choices))
 
 
 def _put_together(
@@ -249,17 +259,18 @@ def _put_together(
     places = sorted(
         by_place, key=lambda place: (position[place[0]], in_order(place[1]))
     )
-    rows = [
-        by_place[cell, seed].row() | {"cell": position[cell], "seed": seed}
-        for cell, seed in places
-    ]
+    columns: dict[str, list[Any]] = {}
+    for cell, seed in places:
+        row = by_place[cell, seed].row() | {"cell": position[cell], "seed": seed}
+        for name, value in row.items():
+            columns.setdefault(name, []).append(value)
     types = dict.fromkeys(MEASURES, float) | {"cell": int}
     return Report(
         tree=tree,
         variables=variables,
         constants=constants,
         cells=cells,
-        runs=pd.DataFrame(rows, dtype=object).astype(types),
+        runs=pd.DataFrame(columns, dtype=object).astype(types),
         skipped=tuple(skipped),
     )
 
@@ -272,13 +283,15 @@ def _completed_choices(runs: Sequence[RunRecord]) -> list[Choices]:
     """
     keys = dict.fromkeys([*(key for run in runs for key in run.choices), SEED])
     usual = {key: _usual_setting(runs, key) for key in keys}
-    return [
-        {
-            key: run.choices.get(key) or run.setting(key) or usual[key] or _DEFAULT
+    completed = []
+    for run in runs:
+        others = {
+            key: run.setting(key) or usual[key] or _DEFAULT
             for key in keys
+            if not run.choices.get(key)
         }
-        for run in runs
-    ]
+        completed.append(run.choices | others if others else run.choices)
+    return completed
 
 
 def _usual_setting(runs: Iterable[RunRecord], key: str) -> str:

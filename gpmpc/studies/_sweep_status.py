@@ -42,7 +42,7 @@ class SweepStatus:
     #: number of runs by state
     counts: dict[RunState, int]
     #: number of failed runs by reason, the most frequent one first; numbers in it are
-    #: those of the first
+    #: those of one of them
     failures: dict[str, int]
     #: runs that end in a second; None where none has ended lately
     rate: float | None
@@ -142,7 +142,7 @@ class SweepWatch:
                     reason = self._reason(path, ended)
                     kind = re.sub(r"\d+", "0", reason)
                     failures[kind] += 1
-                    examples.setdefault(kind, reason)
+                    examples[kind] = min(reason, examples.get(kind, reason))
         if not any(counts.values()):
             raise DataError(f"{self.tree}: holds no sweep, and no run")
         rate, last_end = _rate(ends)
