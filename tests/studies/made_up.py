@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 from rich.console import Console
 
+from gpmpc.gp import Trainer
 from gpmpc.mpc import Box, Timing
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
@@ -49,7 +50,14 @@ def metrics_of(error, steps=20, failing=0, constraints=()):
         (timing,) * steps,
         1.0,
     )
-    experiment = Experiment(None, None, PLANT, None, lambda plant: None, steps=steps)
+    experiment = Experiment(
+        data=None,
+        trajectory=None,
+        system=PLANT,
+        train=Trainer(),
+        controller=lambda plant: None,
+        steps=steps,
+    )
     return metrics(
         experiment, Flown(rollout, SimpleNamespace(problem=problem, horizon=2), None)
     )
