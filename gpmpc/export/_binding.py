@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 
 from gpmpc.exceptions import SettingError
+from gpmpc.export._functions import FunctionWriter
+from gpmpc.export._text import Numbers
 from gpmpc.export._write import Precision, write_code
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import GPMPC, Decision, PredictionSettings, Problem, Reference, Timing
-from gpmpc.mpc._controller import read_reference
+from gpmpc.mpc._controller import read_parameters, read_reference
 from gpmpc.propagation import Propagator
 from gpmpc.qp import QPSolver
 from gpmpc.signals import Signals
@@ -83,10 +85,14 @@ class CompiledLibrary:
         """Returns what a memory keeps from step to step, as a view of it."""
         return self.Kept.from_buffer(memory)
 
-    def reference(self, reference: Reference, horizon: int) -> Any:
-        """Returns a reference as the code takes it."""
+    def reference(
+        self, reference: Reference, horizon: int, parameters: Any = None
+    ) -> Any:
+        """Returns a reference, and parameters, as the code takes them."""
         followed = reference.over(horizon)
         converted = self.ReferenceType()
+        if parameters is not None:
+            view(converted.parameters)[:] = read_parameters(parameters, horizon)
         view(converted.states)[:] = followed.states
         if followed.inputs is not None:
             view(converted.inputs)[:] = followed.inputs
@@ -144,15 +150,16 @@ class CompiledController:
         belief: Gaussian,
         reference: Reference,
         previous: Decision | None = None,
+        parameters: Any = None,
     ) -> Decision:
-        """Decides the input for one step; see ``Controller.control``."""
+        """Decides the input for one step; see ``GPMPC.control``."""
         began = perf_counter()
         library = self._library
         memory = library.new_memory()
         kept = library.kept(memory)
         if previous is not None:
             self._continue(kept, previous)
-        converted = library.reference(reference, self.horizon)
+        converted = library.reference(reference, self.horizon, parameters)
         input = library.step(memory, belief, converted, len(self.initial_input))
         timing = Timing(solve=perf_counter() - began)
         return _decision(kept, input, timing)
@@ -230,14 +237,14 @@ class CompiledLoop:
         self.failed = False
         self.seconds = 0.0
 
-    def input(self, state: Any, reference: Any) -> Array:
+    def input(self, state: Any, reference: Any, parameters: Any = None) -> Array:
         """Returns the input to apply now (m,); see ``ControlLoop.input``."""
         belief = state
         if not isinstance(state, Gaussian):
             belief = Gaussian.certain(np.asarray(state, dtype=float))
         controller = self._controller
         followed = self._library.reference(
-            read_reference(reference), controller.horizon
+            read_reference(reference), controller.horizon, parameters
         )
         m = len(controller.initial_input)
         began = perf_counter()
@@ -321,13 +328,14 @@ def _reference_type(controller: GPMPC, number: Any) -> type[ctypes.Structure]:
     n = controller.prediction.state_dim
     m = controller.prediction.input_dim
     H = controller.horizon
+    parameters = FunctionWriter(controller, Numbers("double")).parameters
 
     class ReferenceType(ctypes.Structure):
         _fields_ = (
             ("states", (number * n) * (H + 1)),
             ("inputs", (number * m) * H),
             ("has_inputs", ctypes.c_int),
-            ("parameters", (number * 1) * H),
+            ("parameters", (number * max(1, parameters)) * H),
         )
 
     return ReferenceType

@@ -4,7 +4,7 @@ from typing import Any
 
 from gpmpc._dynamics import check_next_states
 from gpmpc.exceptions import SettingError, check_choice
-from gpmpc.mpc import GPMPC, Inequality
+from gpmpc.mpc import GPMPC
 from gpmpc.qp import DualActiveSet
 
 
@@ -47,8 +47,3 @@ def _check_solver(solver: Any) -> None:
     if solver.time_limit is not None:
         rule = "an exported step knows no clock; take iteration_limit"
         raise SettingError("solver.time_limit", f"{rule}; got {solver.time_limit}")
-
-
-def is_smooth(constraint: Any) -> bool:
-    """Returns whether a constraint is a function that is linearised along plans."""
-    return isinstance(constraint, Inequality)

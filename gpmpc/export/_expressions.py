@@ -317,16 +317,32 @@ def value_lines(
 
 
 def expansion_lines(
-    graph: Graph, value: Sequence[int], inputs: Sequence[str], numbers: Numbers
+    graph: Graph,
+    value: Sequence[int],
+    inputs: Sequence[str],
+    numbers: Numbers,
+    columns: Sequence[int] | None = None,
+    width: int | None = None,
 ) -> list[str]:
-    """Returns the lines that write ``value[i]`` and ``jacobian[i * d + c]``.
+    """Returns the lines that write ``value[i]`` and ``jacobian[i * width + column]``.
 
     Entries of the Jacobian that are always zero are not written.
+
+    Args:
+        graph: Of the function.
+        value: Nodes of its value.
+        inputs: Names of its inputs.
+        numbers: Of the precision.
+        columns: Of the inputs in the Jacobian; by default their numbers.
+        width: Columns of the Jacobian, beyond which none is written; by default the
+            number of inputs.
     """
-    d = len(inputs)
+    width = len(inputs) if width is None else width
+    columns = range(len(inputs)) if columns is None else columns
     results = [(f"value[{i}]", node) for i, node in enumerate(value)]
     for i, node in enumerate(value):
-        for column, derivative in sorted(graph.derivatives(node).items()):
-            if column < d:
-                results.append((f"jacobian[{i * d + column}]", derivative))
+        for number, derivative in sorted(graph.derivatives(node).items()):
+            if columns[number] < width:
+                place = i * width + columns[number]
+                results.append((f"jacobian[{place}]", derivative))
     return graph.statements(results, inputs, numbers)

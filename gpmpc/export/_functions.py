@@ -1,10 +1,14 @@
 """Smooth constraints and outputs of the cost as C."""
 
+from collections.abc import Sequence
 from typing import Any
 
 from gpmpc.exceptions import SettingError
+from gpmpc.export._expressions import expansion_lines, graph_of_tape
 from gpmpc.export._text import Numbers
-from gpmpc.mpc import GPMPC
+from gpmpc.models import CasadiFunction
+from gpmpc.mpc import GPMPC, Inequality
+from gpmpc.mpc._cost import by_stage
 
 
 class FunctionWriter:
@@ -13,16 +17,140 @@ class FunctionWriter:
     Attributes:
         parameters: How many parameters they take, q.
         text: All that was written.
+
+    Raises:
+        SettingError: One of them is no CasADi function of elementary operations.
     """
 
     def __init__(self, controller: GPMPC, numbers: Numbers):
         self._numbers = numbers
+        self._n = controller.prediction.state_dim
+        self._m = controller.prediction.input_dim
+        self._horizon = controller.horizon
+        self._parts: list[str] = []
         self.parameters = 0
-        self.text = ""
-        problem: Any = controller.problem
         if controller.prediction.constraints.smooth:
-            rule = "an exported constraint is a Box or Halfspaces"
-            raise SettingError("constraints", f"{rule}; got Inequality")
-        if problem.outputs:
-            rule = "an exported cost has none"
-            raise SettingError("outputs", f"{rule}; got {len(problem.outputs)}")
+            self._write_constraints(controller)
+        if controller.problem.outputs:
+            self._write_outputs(controller.problem.outputs)
+        self.text = "\n".join(self._parts)
+
+    def _write_constraints(self, controller: GPMPC) -> None:
+        """Writes h(x, u, p) of all rows, with their gradients."""
+        n = self._n
+        m = self._m
+        rows = 0
+        body = []
+        for i, constraint in enumerate(controller.problem.constraints):
+            count = len(constraint.rows(self._horizon).F)
+            if isinstance(constraint, Inequality):
+                name = f"inequality{i}"
+                self._write_function("h", constraint.h, constraint.count, name)
+                body += [
+                    "{",
+                    f"    real value[{count}];",
+                    f"    real jacobian[{count * (n + m)}];",
+                    f"    {name}(x, u, p, value, jacobian);",
+                    f"    for (i = 0; i < {count}; i++) {{",
+                    f"        h[{rows} + i] = value[i];",
+                    f"        copy(jacobian + i * (n + m), E + ({rows} + i) * n, n);",
+                    f"        copy(jacobian + i * (n + m) + n, D + ({rows} + i) * m, m);",
+                    "    }",
+                    "}",
+                ]
+            rows += count
+        signature = (
+            "static void constraints(const real *x, const real *u, const real *p,\n"
+            "    real *h, real *E, real *D)"
+        )
+        self._function(signature, ["int i;", *body], "h(x, u, p) <= 0")
+
+    def _write_outputs(self, outputs: Sequence[Any]) -> None:
+        """Writes the squares Z = [J, e]' W [J, e] of the outputs along a plan."""
+        body = [
+            "int finite = 1;",
+            "int k, i, j, l;",
+            "fill(&problem->Z[0][0][0], 0,",
+            "     H * GPMPC_AUGMENTED * GPMPC_AUGMENTED);",
+            "for (k = 0; k < H; k++) {",
+            "    const real *x = problem->states[k + 1];",
+            "    const real *u = problem->inputs[k];",
+            "    const real *p = reference->parameters[k];",
+        ]
+        for i, output in enumerate(outputs):
+            name = f"output{i}"
+            count = output.weight.shape[-1]
+            self._write_function("y", output.y, count, name)
+            weight = by_stage("weight", output.weight, self._horizon, 2)
+            centre = by_stage("reference", output.reference, self._horizon, 1)
+            table = self._numbers.table
+            self._parts.append(table(f"{name}_weight", weight, "W (H, d, d)"))
+            self._parts.append(table(f"{name}_reference", centre, "c (H, d)"))
+            body += ["    " + line for line in _square_lines(name, count)]
+        body += ["}", "return finite;"]
+        signature = (
+            "static int write_outputs(gpmpc_problem *problem,\n"
+            "    const gpmpc_reference *reference)"
+        )
+        self._function(signature, body, "squares of y(x, u, p) - c along the plan")
+
+    def _write_function(self, key: str, function: Any, count: int, name: str) -> None:
+        """Writes a function of (x, u, p) with its derivatives by x and u."""
+        if not hasattr(function, "n_in"):
+            rule = "an exported function is one of CasADi"
+            raise SettingError(key, f"{rule}; got {type(function).__name__}")
+        wrapped = CasadiFunction(function)
+        if wrapped.tape is None:
+            rule = "an exported function is made of elementary operations"
+            raise SettingError(key, f"{rule}; got {function}")
+        inputs: list[str] = []
+        columns: list[int] = []
+        for argument, size in enumerate(wrapped.sizes):
+            inputs += [f"{'xup'[argument]}[{i}]" for i in range(size)]
+            offset = (0, self._n, self._n + self._m)[argument]
+            columns += [offset + i for i in range(size)]
+        if len(wrapped.sizes) > 2:
+            self.parameters = max(self.parameters, wrapped.sizes[2])
+        graph, value = graph_of_tape(wrapped.tape)
+        lines = expansion_lines(
+            graph, value, inputs, self._numbers, columns, self._n + self._m
+        )
+        signature = (
+            f"static void {name}(const real *x, const real *u, const real *p,\n"
+            "    real *value, real *jacobian)"
+        )
+        unused = ["(void)x;", "(void)u;", "(void)p;"]
+        size = count * (self._n + self._m)
+        self._function(signature, [*unused, f"fill(jacobian, 0, {size});", *lines], key)
+
+    def _function(self, signature: str, body: Sequence[str], comment: str) -> None:
+        """Writes a function, what it is above it."""
+        lines = "\n".join(f"    {line}" for line in body)
+        self._parts.append(f"/* {comment} */\n{signature}\n{{\n{lines}\n}}\n")
+
+
+def _square_lines(name: str, count: int) -> list[str]:
+    """Returns the lines that add the square of one output to Z of stage k."""
+    return [
+        "{",
+        f"    real value[{count}];",
+        f"    real jacobian[{count} * (n + m)];",
+        f"    real rows[{count} * GPMPC_AUGMENTED];",
+        f"    const real *W = {name}_weight + k * {count * count};",
+        f"    {name}(x, u, p, value, jacobian);",
+        f"    finite = finite && all_finite(value, {count})",
+        f"             && all_finite(jacobian, {count} * (n + m));",
+        f"    for (i = 0; i < {count}; i++) {{",
+        "        real *row = rows + i * GPMPC_AUGMENTED;",
+        "        copy(jacobian + i * (n + m), row, n + m);",
+        f"        row[n + m] = value[i] - {name}_reference[k * {count} + i]",
+        "                     - dot(row, x, n) - dot(row + n, u, m);",
+        "    }",
+        f"    for (i = 0; i < {count}; i++)",
+        f"        for (j = 0; j < {count}; j++)",
+        "            for (l = 0; l < GPMPC_AUGMENTED; l++)",
+        f"                add_scaled(W[i * {count} + j] * rows[i * GPMPC_AUGMENTED + l],",
+        "                           rows + j * GPMPC_AUGMENTED, problem->Z[k][l],",
+        "                           GPMPC_AUGMENTED);",
+        "}",
+    ]

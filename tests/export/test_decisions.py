@@ -2,6 +2,7 @@
 
 import shutil
 
+import casadi
 import numpy as np
 import pytest
 import torch
@@ -15,6 +16,8 @@ from gpmpc.mpc import (
     Box,
     ControlLoop,
     Halfspaces,
+    Inequality,
+    LeastSquares,
     PredictionSettings,
     Problem,
     Reference,
@@ -114,6 +117,18 @@ def tube(penalty):
     return gpmpc(problem)
 
 
+def obstacle():
+    """A disc in the plane of the states, and a cost of energy, in CasADi."""
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u")
+    distance = casadi.sqrt((x[0] - 0.5) ** 2 + 0.2 * x[1] ** 2 + 1e-3)
+    apart = Inequality(casadi.Function("h", [x], [0.3 - distance]), probability=0.8)
+    energy = casadi.vertcat(casadi.sin(x[0]) + 0.1 * u, x[1] * u)
+    output = LeastSquares(casadi.Function("y", [x, u], [energy]), [0.3, 0.1])
+    box = Box([-2.0, -np.inf], [2.0, np.inf])
+    return gpmpc(Problem(WEIGHTS, TORQUES, constraints=[box, apart], outputs=[output]))
+
+
 CONTROLLERS = {
     "inputs": lambda: gpmpc(Problem(Tracking([1.0, 0.1], [0.05], penalized="inputs"))),
     "deviations": lambda: gpmpc(
@@ -122,6 +137,7 @@ CONTROLLERS = {
     "elastic tube": lambda: tube("elastic"),
     "exact tube": lambda: tube("exact"),
     "hard tube": lambda: tube(None),
+    "obstacle and energy": obstacle,
     "velocity form": lambda: gpmpc(Problem(WEIGHTS, TORQUES), form="velocity"),
     "delay, estimate, angles": delayed,
     "disturbance as a state": disturbed,

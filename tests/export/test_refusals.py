@@ -1,0 +1,75 @@
+"""What cannot be exported is refused by name, before anything is written."""
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.exceptions import SettingError
+from gpmpc.export import export_c
+from gpmpc.mpc import GPMPC, Inequality, PredictionSettings, Problem, Tracking
+from gpmpc.mpc.baselines import LQR
+from gpmpc.propagation import Linearization, MomentMatching
+from gpmpc.qp import DualActiveSet, PrimalActiveSet
+from tests.mpc.small_models import double_integrator, pendulum_posterior
+
+GP = pendulum_posterior()
+PROBLEM = Problem(Tracking([1.0, 0.1], [0.05]))
+
+
+def gpmpc(
+    model=GP, propagator=None, problem=PROBLEM, iterations=1, solver=None, **prediction
+):
+    return GPMPC(
+        model,
+        Linearization() if propagator is None else propagator,
+        problem,
+        5,
+        [0.0],
+        prediction=PredictionSettings(**prediction),
+        iterations=iterations,
+        solver=solver,
+    )
+
+
+def outside_a_disc(states):
+    return 1.0 - torch.linalg.vector_norm(states, dim=1, keepdim=True)
+
+
+REFUSED = {
+    "controller": lambda: LQR(GP, PROBLEM, 5, [0.0]),
+    "iterations": lambda: gpmpc(iterations=None),
+    "covariance": lambda: gpmpc(covariance="full"),
+    "propagator": lambda: gpmpc(propagator=MomentMatching()),
+    "solver": lambda: gpmpc(solver=PrimalActiveSet()),
+    "solver.time_limit": lambda: gpmpc(solver=DualActiveSet(time_limit=1.0)),
+    "model": lambda: gpmpc(model=double_integrator()),
+    "h": lambda: gpmpc(
+        problem=Problem(
+            Tracking([1.0, 0.1], [0.05]), constraints=[Inequality(outside_a_disc)]
+        )
+    ),
+}
+
+
+@pytest.mark.parametrize("key", REFUSED)
+def test_refuses_by_name(key, tmp_path):
+    with pytest.raises(SettingError) as caught:
+        export_c(REFUSED[key](), tmp_path / "folder")
+    assert caught.value.key == key
+    assert not (tmp_path / "folder").exists()
+
+
+@pytest.mark.parametrize(
+    ("key", "value"), [("precision", "half"), ("on_failure", "raise")]
+)
+def test_refuses_other_words(key, value, tmp_path):
+    with pytest.raises(SettingError, match=key):
+        export_c(gpmpc(), tmp_path / "folder", **{key: value})
+
+
+def test_numbers_are_read_back_to_the_same_bits(tmp_path):
+    export = export_c(gpmpc(), tmp_path)
+    source = export.source.read_text()
+    text = source.partition("gp0_weights")[2].partition("{")[2].partition("}")[0]
+    weights = np.array([float(number) for number in text.split(",")])
+    assert (weights == GP.weights.numpy().ravel()).all()
