@@ -27,7 +27,7 @@ class NominalSystem:
     code: str  #: such as "my_robot:Arm"
     #: those that are fitted; none for all of its arguments that are numbers
     parameters: tuple[FittedParameter, ...] = ()
-    bounded: frozenset[str] = frozenset()  #: parameters whose bounds are given
+    bounded: tuple[str, ...] = ()  #: parameters whose bounds are given
     fixed: dict[str, Any] = field(default_factory=dict)  #: its other arguments
 
     def __post_init__(self) -> None:
@@ -61,12 +61,12 @@ class NominalSystem:
         parameters = [_read_parameter(*item) for item in entries.items()]
         fixed = content.get("fixed") or {}
         _check_keys("nominal.fixed", fixed, None)
-        bounded = {
-            name
+        bounded = [
+            str(name)
             for name, entry in entries.items()
             if isinstance(entry, Mapping) and {"low", "high"} & {*entry}
-        }
-        return cls(code, tuple(parameters), frozenset(bounded), dict(fixed))
+        ]
+        return cls(code, tuple(parameters), tuple(bounded), dict(fixed))
 
 
 def _read_parameter(name: Any, entry: Any) -> FittedParameter:

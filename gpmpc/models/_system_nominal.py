@@ -21,6 +21,7 @@ from gpmpc.systems import System
 _TIME_STEP = "time_step"  # argument of factories that is no parameter
 _SHORT_STEP = 0.01  # [s] of a substep of the integration, about
 _MOST_SUBSTEPS = 10
+_KEPT = 100  # systems, of the parameters that were tried last
 _ALIKE = 1e-9  # between two ways to the same outputs
 _DISPLACED = 1.07  # factor of a parameter for which they are compared
 
@@ -115,7 +116,7 @@ class SystemNominal:
         """Computes the rates of change (..., n) at states (..., n)."""
         parameters = [np.asarray(value, dtype=float) for value in theta]
         if all(value.ndim == 0 for value in parameters):
-            return self._rates(self._made(parameters), states, inputs)
+            return self._rates_of_rows(self._made(parameters), states, inputs)
         if self._takes_arrays:
             return self._rates(self._with_arrays(parameters), states, inputs)
         return self._outputs_one_by_one(parameters, states, inputs)
@@ -134,11 +135,21 @@ class SystemNominal:
         return _order(self._system.input_names, self.input_names)
 
     def _made(self, values: Sequence[Any]) -> System:
-        """Makes the system of parameters, by its factory."""
-        parameters = dict(zip(self.parameter_names, map(float, values), strict=True))
-        return make_system(
-            self.factory, self.code, {**self.fixed, **parameters}, self.time_step
-        )
+        """Makes the system of parameters, by its factory; the last ones are kept."""
+        key = tuple(map(float, values))
+        if key not in self._made_systems:
+            parameters = dict(zip(self.parameter_names, key, strict=True))
+            arguments = {**self.fixed, **parameters}
+            if len(self._made_systems) >= _KEPT:
+                self._made_systems.clear()
+            self._made_systems[key] = make_system(
+                self.factory, self.code, arguments, self.time_step
+            )
+        return self._made_systems[key]
+
+    @cached_property
+    def _made_systems(self) -> dict[tuple[float, ...], System]:
+        return {}
 
     def _with_arrays(self, values: Sequence[Array]) -> System:
         """Puts arrays into the place of the system's parameters."""
@@ -189,8 +200,21 @@ class SystemNominal:
                 system = self._made(values)
             except GpmpcError:
                 continue
-            outputs[row] = self._rates(system, states[row], inputs[row])
+            outputs[row] = self._rates_of_rows(system, states[row], inputs[row])
         return outputs
+
+    def _rates_of_rows(self, system: System, states: Array, inputs: Array) -> Array:
+        """Computes the rates of change (..., n), of all rows in one table.
+
+        A simulator steps a table (K, n), and no other batch.
+        """
+        inputs = np.broadcast_to(inputs, (*states.shape[:-1], inputs.shape[-1]))
+        rows = self._rates(
+            system,
+            states.reshape(-1, states.shape[-1]),
+            inputs.reshape(-1, inputs.shape[-1]),
+        )
+        return rows.reshape(states.shape)
 
     def _rates(self, system: System, states: Array, inputs: Array) -> Array:
         """Computes the rates of change (..., n) of a system."""

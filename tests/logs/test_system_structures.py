@@ -139,7 +139,7 @@ def test_a_dynamic_bicycle_predicts_what_its_tyres_do(tmp_path):
     plant = dynamic_bicycle(
         0.02, front_stiffness=45, rear_stiffness=60, drive_gain=4, drag=0.8
     )
-    table = flight(plant, excitation(500, (0, 0.25), (0.5, 0.2)))
+    table = flight(plant, excitation(300, (0, 0.25), (0.5, 0.2)))
     mapping = {
         **CAR,
         "states": {
@@ -151,7 +151,7 @@ def test_a_dynamic_bicycle_predicts_what_its_tyres_do(tmp_path):
     }
     log = log_of(tmp_path, table, mapping)
     structure = bases(log)[0]
-    fit = fit_nominal(structure.model, None, log, steps=15)
+    fit = fit_nominal(structure.model, None, log, steps=8)
     windows = log.windows(15, past=0, most=30)
     errors = fit.model.rollout_errors(windows, [15])
     still = windows.errors(
@@ -251,6 +251,44 @@ def test_a_users_own_system_is_fitted_with_what_it_derives(arm, nominal):
     assert not structure.model.nominal._takes_arrays
     low, _ = structure.model.nominal.bounds
     assert (low > 0).all()  # negative ones are refused
+
+
+ROD = """
+from gpmpc.systems.mujoco_ import mujoco_system
+
+XML = '''<mujoco><option timestep="0.01"/><worldbody><body>
+<joint name="hinge" type="hinge" axis="0 1 0" damping="{damping}"/>
+<geom type="capsule" fromto="0 0 0 0 0 0.5" size="0.02" mass="{mass}"/>
+</body></worldbody>
+<actuator><motor name="motor" joint="hinge"/></actuator></mujoco>'''
+
+
+def make_rod(folder, mass=0.5, damping=0.02):
+    path = f"{folder}/rod.xml"
+    with open(path, "w") as file:
+        file.write(XML.format(mass=mass, damping=damping))
+    return mujoco_system(path, ["motor"], joints=["hinge"], substeps=2)
+"""
+
+
+def test_a_mujoco_model_is_fitted_by_a_function_that_writes_it(tmp_path, monkeypatch):
+    pytest.importorskip("mujoco")
+    (tmp_path / "my_rod.py").write_text(ROD)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_rod", raising=False)
+    from my_rod import make_rod
+
+    plant = make_rod(tmp_path, mass=0.6, damping=0.05)
+    states = [np.zeros(2)]
+    inputs = excitation(200, (0, 1.5))
+    for u in inputs[:-1]:
+        states.append(step(plant, states[-1], u))
+    table = pandas.DataFrame(np.array(states), columns=["angle", "rate"])
+    table = table.assign(t=0.02 * np.arange(200), torque=inputs[:, 0])
+    nominal = {"system": "my_rod:make_rod", "fixed": {"folder": str(tmp_path)}}
+    log = log_of(tmp_path, table, {**PENDULUM, "nominal": nominal})
+    values, _ = fitted_values(log, steps=10)
+    assert values == pytest.approx({"mass": 0.6, "damping": 0.05}, rel=0.01)
 
 
 def test_start_bounds_and_fixed_arguments_are_the_mappings(arm):
