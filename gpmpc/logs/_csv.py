@@ -70,7 +70,8 @@ def _findings(path: Path, csv: CsvText) -> Iterator[Finding]:
     """Yields what was noticed in a text, once all of it is read."""
     run = run_name(path)
     if csv.skipped:
-        text = f"{csv.skipped} lines before the rows that name no column: left out"
+        lines = "1 line" if csv.skipped == 1 else f"{csv.skipped} lines"
+        text = f"{lines} before the rows without names of columns: left out"
         yield Finding("lines before the rows", run, csv.skipped, text)
     if not csv.names:
         text = "no line names the columns: they are called by their numbers, 1, 2, ..."

@@ -10,6 +10,7 @@ import codecs
 import csv
 import io
 import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import chain, islice
 from typing import NamedTuple
@@ -27,6 +28,7 @@ _BRACKETS = re.compile(r"\[.*\]|\(.*\)")
 _ABSENT = frozenset(("", "NA", "N/A", "n/a", "null", "NULL", "None", "<NA>"))
 _SAMPLE = 50  # lines by which the text is recognised
 _COMMENTS = 50  # before the first line that may hold the names of the columns
+_HEADER = 2  # lines before the rows that may hold the names, and the units
 _START = 1000  # bytes that the encoding is looked for in
 _ENCODING_MARKS = (  # the longer marks first: that of UTF-32 begins as that of UTF-16
     (codecs.BOM_UTF32_LE, "utf-32"),
@@ -86,7 +88,7 @@ def open_csv(where: str, file: io.BufferedReader) -> CsvText:
         )
     delimiter = _find_delimiter(head)
     fields = [_split_line(line, delimiter) for line in head]
-    first = _first_row(fields)
+    first = _first_row(fields, delimiter)
     rows = fields[first:]
     if delimiter == ",":
         _check_decimal_commas(where, fields[first - 1 : first], rows)
@@ -239,12 +241,23 @@ def _find_delimiter(lines: Sequence[str]) -> str:
     )
 
 
-def _first_row(lines: Sequence[Fields]) -> int:
-    """Finds the first line of values; the one behind the first if none has a number."""
+def _first_row(lines: Sequence[Fields], delimiter: str) -> int:
+    """Finds the first line of values; the one behind the first if none has a number.
+
+    Between white space, sentences have numbers too: rows are as wide as most lines.
+    """
+    is_numeric = [any(map(_is_number, fields)) for fields in lines]
+    widths = Counter(
+        len(fields)
+        for fields, numeric in zip(lines, is_numeric, strict=True)
+        if numeric
+    )
+    usual_width = widths.most_common(1)[0][0] if widths else 0
     for index, fields in enumerate(lines):
         is_first = index == 0 and len(lines) > 1
         is_header = is_first and _names_numbers(fields, lines[1])
-        if any(map(_is_number, fields)) and not is_header:
+        fits = delimiter != WHITE_SPACE or len(fields) == usual_width
+        if is_numeric[index] and fits and not is_header:
             while index > 0 and not any(lines[index - 1]):  # rows without a value
                 index -= 1
             return index
@@ -276,7 +289,7 @@ def _find_header(
     if not rows:
         return _Header(_split_line(lines[0], delimiter), skipped=0)
     for separators in ((delimiter,), DELIMITERS):
-        names = _last_names(lines, rows, separators)
+        names = _last_names(lines[-_HEADER:], rows, separators)
         if names:
             return _Header(names, skipped=len(lines) - 1)
         names = _last_names(comments, rows, separators)
@@ -308,12 +321,18 @@ def _split_names(
     for separator in separators:
         names = _split_line(line, separator)
         if _count_filled(names) <= widest and len(names) >= filled:
-            is_sentence = any(name.endswith((".", ":", ",")) for name in names)
-            return [] if separator == WHITE_SPACE and is_sentence else names
+            return [] if _are_sentences(names, separator) else names
     if WHITE_SPACE in separators:  # names of several words
         names = [name.strip() for name in _WIDE_SPACE.split(line.strip())]
         return names if len(names) == widest else []
     return []
+
+
+def _are_sentences(names: Fields, separator: str) -> bool:
+    """Tells whether a line is rather a sentence than names, by its marks."""
+    if separator == WHITE_SPACE:
+        return any(name.endswith((".", ":", ",")) for name in names)
+    return any(": " in name for name in names)
 
 
 def _count_filled(fields: Fields) -> int:

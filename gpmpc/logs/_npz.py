@@ -28,7 +28,9 @@ class _DeclaredArray(NamedTuple):
 
     @property
     def is_table(self) -> bool:
-        """Whether it has columns of numbers or short texts."""
+        """Whether it is a number, or has columns of numbers or short texts."""
+        if not self.shape:
+            return self.is_number
         return len(self.shape) in (1, 2) and self.dtype.kind in "biufSU"
 
     @property
@@ -44,8 +46,8 @@ def read_npz(path: Path, options: ReadOptions) -> LogFile:
     columns: dict[str, np.ndarray] = {}
     with np.load(path, allow_pickle=False) as archive:
         for name, array in tables.items():
-            values = archive[name]
-            if len(array.shape) == 1:
+            values = np.atleast_1d(archive[name])
+            if len(array.shape) < 2:
                 columns[name] = values
                 continue
             for i, column in enumerate(values.T):

@@ -168,6 +168,18 @@ def test_runs_that_stand_side_by_side_are_held_out_by_their_names(tmp_path):
     assert hint in inspect_log(path).warnings
 
 
+def test_arrays_of_numpy_may_differ_in_length_as_well(tmp_path):
+    table = record()
+    arrays = {"u": table["u"], "y": table["y"], "late": table["y"][:90], "Ts": STEP}
+    np.savez(tmp_path / "tank.npz", **arrays)
+    log = read_log(tmp_path / "tank.npz", mapping_of(time={"step": "Ts"}))
+    assert (len(log), log.time_step) == (ROWS, STEP)
+    short = read_log(
+        tmp_path / "tank.npz", mapping_of(y="late", runs={"a": {"u": "y"}})
+    )
+    assert len(short.runs[0]) == 90
+
+
 def test_columns_by_number_are_called_as_their_signals(tmp_path):
     path, mapping = daisy(tmp_path)
     log = read_log(path, mapping)
@@ -229,6 +241,7 @@ def test_a_wrong_way_of_saying_it_is_named(change, text):
         ("t,1,2\n0,1,2\n1,3,4\n", ["t", "1", "2"], 2),
         ("sep=;\nt;a\n0;1\n", ["t", "a"], 1),
         ("Tank\nTime (s)  Level (m)\n0.0 1.0\n", ["Time (s)", "Level (m)"], 1),
+        ("Tank\nColumns: 1 input, 2 output\n0 1\n1 2\n2 3\n", ["1", "2"], 3),
         ("t,a\ns,V\n0,1\n1,2\n", ["t", "a"], 2),
         ("V,A\n0,1\n1,2\n", ["V", "A"], 2),
         ("a,b\n,\n0,1\n", ["a", "b"], 2),
