@@ -12,6 +12,7 @@ import argparse
 import json
 import os
 import random
+import statistics
 import subprocess
 import sys
 import time
@@ -26,10 +27,13 @@ def gpmpc(*words: str) -> tuple[str, float, float]:
     command = [sys.executable, "-c", "from gpmpc.cli import main; main()", *words]
     start = time.perf_counter()
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
         output = process.stdout.read()
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
     seconds = time.perf_counter() - start
+    times = usage.ru_utime + usage.ru_stime
+    print(f"gpmpc {words[0]}: {times:.1f} s of processors", flush=True)
     if process.returncode:
         raise SystemExit(f"gpmpc {' '.join(words)}: exit code {process.returncode}")
     return output, seconds, usage.ru_maxrss / 1024
@@ -60,6 +64,47 @@ def make(folder: Path, count: int) -> None:
     (tree / "sweep-0000000000.json").write_text(json.dumps({"runs": plan}))
 
 
+def fly(folder: Path, count: int) -> None:
+    """Flies ``count`` short runs by joblib, and says what they cost beside flying."""
+    words = ["run", "-m", *FLIGHT, f"seed=range({count})", f"folder={folder}"]
+    words += ["launcher=joblib", "hydra.launcher.n_jobs=2"]
+    output, seconds, memory = gpmpc(*words)
+    print(output.splitlines()[-1])
+    begun = [path.stat().st_mtime for path in folder.glob("*/config.yaml")]
+    ended = [path.stat().st_mtime for path in folder.glob("*/metrics.json")]
+    print(
+        f"{seconds:.1f} s in all, {seconds - (max(ended) - min(begun)):.1f} s of them"
+    )
+    print(f"before the first run and behind the last; {memory:.0f} MB in the driver")
+    print(f"{1e3 * (max(ended) - min(begun)) / count:.0f} ms a run, two processes")
+    flights = [_flight(path) for path in folder.glob("*/metrics.json")]
+    print(
+        f"{1e3 * statistics.median(flights):.0f} ms of training and decisions in each"
+    )
+    _, seconds, _ = gpmpc(*words)
+    print(f"{seconds:.1f} s to find all of it finished")
+
+
+def _flight(path: Path) -> float:
+    """Returns the time of the training and of all decisions of a run [s]."""
+    result = json.loads(path.read_text())
+    times = result["times"]
+    return times["training"] + result["steps"] * times["total"]["median"]
+
+
+def read(folder: Path) -> None:
+    """Prints what status and report of a sweep take, with and without its index."""
+    tree = folder / "sweep" if (folder / "sweep").is_dir() else folder
+    (tree / "index.jsonl").unlink(missing_ok=True)
+    for title, words in (
+        ("status", ["status", str(tree)]),
+        ("report, no index yet", ["report", str(tree)]),
+        ("report", ["report", str(tree)]),
+    ):
+        _, seconds, memory = gpmpc(*words)
+        print(f"{title}: {seconds:.1f} s, {memory:.0f} MB")
+
+
 def main() -> None:
     """Runs one of the three."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -67,8 +112,12 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("count", type=int, nargs="?", default=2000)
     arguments = parser.parse_args()
-    if arguments.act == "make":
+    if arguments.act == "fly":
+        fly(arguments.folder, arguments.count)
+    elif arguments.act == "make":
         make(arguments.folder, arguments.count)
+    else:
+        read(arguments.folder)
 
 
 if __name__ == "__main__":

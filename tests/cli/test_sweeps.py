@@ -335,6 +335,23 @@ def test_a_sweep_flies_every_combination(sweep):
     )
 
 
+def test_status_says_in_a_line_how_far_a_sweep_is(sweep, tmp_path):
+    tree = tmp_path / "tree"
+    shutil.copytree(sweep[0], tree)
+    (path, *_) = sorted(tree.glob("*/metrics.json"))
+    path.with_name("error.json").write_text('{"error": "no such data"}')
+    path.unlink()
+    done = forked("status", "tree", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "4 runs: 3 finished, 1 failed; 1 failed: no such data\n"
+    data = json.loads(forked("status", "tree", "--json", cwd=tmp_path).stdout)
+    assert (data["runs"], data["finished"], data["failed"]) == (4, 3, 1)
+    assert data["failures"] == {"no such data": 1}
+    nothing = forked("status", "nowhere", cwd=tmp_path)
+    assert nothing.returncode == 2
+    assert nothing.stderr == "gpmpc: nowhere: no such folder\n"
+
+
 def needs(module):
     """A launcher that an extra brings; tried out by hand."""
     missing = pytest.mark.skipif(
