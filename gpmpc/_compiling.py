@@ -25,9 +25,8 @@ def report_compilation() -> Iterator[None]:
             if not self.started:
                 self.started = True
                 print(
-                    "compiling numerical kernels for about half a minute: once on "
-                    "this machine for this kind of controller (gpmpc warmup does it "
-                    "for all)",
+                    "compiling numerical kernels for about half a minute, once on "
+                    "this machine for this kind of controller and model",
                     flush=True,
                 )
             super().on_start(event)
