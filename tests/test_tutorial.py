@@ -46,7 +46,7 @@ def test_the_story_of_the_tutorial_holds(page, tmp_path, capsys):
     few = names["swing_ahead"](names["few"])
     many = names["swing_ahead"](names["gp"])
     assert few["rmse"] > 5 * many["rmse"]
-    assert few["coverage_0.95"] < 0.8 < 0.9 < many["coverage_0.95"]
+    assert few["coverage_0.95"] < 0.5 < many["coverage_0.95"]
     goal = names["plant"].goal
     radii = [
         names[key].stability(goal).spectral_radius for key in ("short", "controller")
