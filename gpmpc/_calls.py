@@ -35,6 +35,15 @@ _OTHER_NAMES = {  # what other packages and papers call it
     "y": "next_states",
 }
 
+_INSIDE = {  # settings that stand inside the value of another argument
+    "disturbance_gain": ("prediction", "PredictionSettings"),
+    "covariance": ("prediction", "PredictionSettings"),
+    "form": ("prediction", "PredictionSettings"),
+    "feedback": ("prediction", "PredictionSettings"),
+    "Q": ("problem", "Problem(Tracking(Q, R))"),
+    "R": ("problem", "Problem(Tracking(Q, R))"),
+}
+
 
 def explains_arguments(target: _Callable) -> _Callable:
     """Makes a function or a class explain calls that do not fit its signature.
@@ -111,5 +120,9 @@ def _nearest(keyword: str, names: list[str]) -> str:
     other_name = _OTHER_NAMES.get(keyword.lower())
     if other_name in names:
         return f" (did you mean {other_name!r}?)"
+    owner, value = _INSIDE.get(keyword, ("", ""))
+    if owner in names:
+        inside = value if "(" in value else f"{value}({keyword}=...)"
+        return f" (did you mean {owner}={inside}?)"
     close = difflib.get_close_matches(keyword.lower(), names, n=1)
     return f" (did you mean {close[0]!r}?)" if close else ""

@@ -1,5 +1,6 @@
 """What a run says at its end are the numbers of its metrics."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -328,3 +329,20 @@ def test_a_flight_is_lost_by_its_judge_or_by_divergence():
     diverged = measured(rollout_of(near), diverged=Diverged(3, "not finite any more"))
     assert diverged["judgement"]["level"] == "lost"
     assert diverged["judgement"]["step"] == 3
+
+
+def test_tracked_states_of_several_units_are_told_unit_by_unit():
+    system = replace(
+        PLANT, tracked=("x", "z", "vx"), lost={"m": 10.0, "m/s": 0.5}, rates={"vx": "x"}
+    )
+    rollout = rollout_of(np.tile([3.0, 0.0, 4.0], (4, 1)))
+    rollout.states[:, 1] += [0.0, 0.1, 0.1, 0.7]
+    result = measured(rollout, system=system)
+    assert result["unit"] == "m"
+    assert result["rmse"]["total"] == pytest.approx(5.0)
+    further = result["further_units"]["m/s"]
+    assert further["states"] == ["vx"]
+    assert further["rmse"] == pytest.approx(np.sqrt((0.01 + 0.01 + 0.49) / 3))
+    assert further["error_at_end"] == pytest.approx(0.7)
+    assert result["lost"]["step"] == 3
+    assert "0.7 m/s from its reference, more than 0.5 m/s" in result["lost"]["reason"]
