@@ -1,6 +1,7 @@
 """What clusters do to sweeps, one act after another; each raises where it fails."""
 
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -8,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.cluster.ray_nodes import RayNodes
+from benchmarks.cluster.slow import SLOW
 from benchmarks.cluster.slurm import Slurm
 from benchmarks.cluster.sweeps import Sweep, end_of
 from gpmpc.studies._run_folder import RunState
@@ -179,8 +181,9 @@ def ray_acts(stage: Stage) -> dict[str, Act]:
             **more,
         )
 
-    def cluster(name: str, blind_to: Path | None = None) -> RayNodes:
-        return RayNodes(Path("/tmp") / f"gpmpc-ray-{name}", blind_to)
+    def cluster(name: str, slow: float = 0.0, blind_to: Path | None = None) -> RayNodes:
+        folder = Path(tempfile.gettempdir()) / f"gpmpc-ray-{name}"
+        return RayNodes(folder, blind_to, {SLOW: str(slow)})
 
     def many() -> None:
         with cluster("many") as nodes:
@@ -190,9 +193,8 @@ def ray_acts(stage: Stage) -> dict[str, Act]:
             act.check(code, stage.reference)
 
     def raylet() -> None:
-        with cluster("raylet") as nodes:
-            nodes.environment["GPMPC_SLOW"] = str(_SLOW)
-            act = sweep("raylet", nodes, slow=_SLOW)
+        with cluster("raylet", slow=_SLOW) as nodes:
+            act = sweep("raylet", nodes)
             process = act.start()
             act.wait_for(3, RunState.RUNNING)
             nodes.kill_node("second")
@@ -201,8 +203,8 @@ def ray_acts(stage: Stage) -> dict[str, Act]:
             act.check(code, stage.reference)
 
     def driver() -> None:
-        with cluster("driver") as nodes:
-            act = sweep("driver", nodes, slow=_SLOW)
+        with cluster("driver", slow=_SLOW) as nodes:
+            act = sweep("driver", nodes)
             process = act.start()
             act.wait_for(3, RunState.RUNNING)
             process.kill()

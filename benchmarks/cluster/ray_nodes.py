@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks.cluster.processes import descendants, free_ports, kill, wait_for
@@ -26,14 +27,21 @@ class RayNodes:
     Args:
         folder: Where it keeps everything; short, since it names sockets.
         blind_to: A folder that the second node does not see.
+        variables: Of the environment of all tasks.
     """
 
-    def __init__(self, folder: Path, blind_to: Path | None = None):
+    def __init__(
+        self,
+        folder: Path,
+        blind_to: Path | None = None,
+        variables: Mapping[str, str] | None = None,
+    ):
         self.folder = folder
         self.blind_to = blind_to
         self.environment = os.environ | {
             "RAY_AUTH_MODE": "disabled",
             "RAY_USAGE_STATS_ENABLED": "0",
+            **(variables or {}),
         }
         (self._port,) = free_ports(1)
         self._daemons: dict[str, subprocess.Popen] = {}

@@ -103,7 +103,7 @@ def launcher_of(config: DictConfig, tree: Path) -> Launcher:
         config: The settings, with Hydra's own.
         tree: The sweep's folder.
     """
-    return instantiate(config.hydra.launcher, tree=tree.absolute())
+    return instantiate(config.hydra.launcher, tree=tree.absolute(), _convert_="all")
 
 
 class Basic:
