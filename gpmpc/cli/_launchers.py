@@ -16,14 +16,14 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from enum import Enum
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-from hydra.utils import instantiate
 from joblib import effective_n_jobs
 from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.backend import resource_tracker
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.parallel import children_ignore_interrupts, end_with
@@ -39,6 +39,13 @@ class Chunk(Protocol):
         ...
 
 
+# Module of this room and class by name in the settings.
+_CLASSES = {
+    "basic": ("_launchers", "Basic"),
+    "joblib": ("_launchers", "Joblib"),
+    "slurm": ("_slurm", "Slurm"),
+    "ray": ("_ray", "Ray"),
+}
 Work = Callable[[Any], object]  # flies a chunk; of a module, so that it can be pickled
 
 
@@ -103,7 +110,18 @@ def launcher_of(config: DictConfig, tree: Path) -> Launcher:
         config: The settings, with Hydra's own.
         tree: The sweep's folder.
     """
-    return instantiate(config.hydra.launcher, tree=tree.absolute(), _convert_="all")
+    node = config.hydra.launcher
+    if node is None or "name" not in node:  # settings of the user's own, without one
+        return Basic(tree.absolute())
+    settings: Any = OmegaConf.to_container(node, resolve=True)
+    name = settings.pop("name")
+    if name not in _CLASSES:
+        raise SettingError(
+            "hydra.launcher.name", f"must be one of {', '.join(_CLASSES)}; got {name!r}"
+        )
+    module, class_name = _CLASSES[name]
+    launcher = getattr(import_module(f"gpmpc.cli.{module}"), class_name)
+    return launcher(tree=tree.absolute(), **settings)
 
 
 class Basic:
