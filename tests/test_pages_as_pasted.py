@@ -22,6 +22,7 @@ from tests.pages import BLOCK, FILE, ROOT, read
 PAGES = ["README.md", *sorted(f"docs/{path.name}" for path in ROOT.glob("docs/*.md"))]
 SHELL = ("", "bash")
 PROGRAMS = {
+    "cc",
     "gpmpc",
     "python",
     "python3",
