@@ -1,7 +1,7 @@
 """Searches for the structure whose rollouts of held-out rows are best.
 
-1. Nominal structures: from every base, by one term more or less at a time; the best
-   one of each round goes on, and the second one if it is close.
+1. Nominal structures: every base, with one term more or less at a time; the best one
+   of each round goes on, and the second one if it is close.
 2. Groups of outputs: those of one nominal structure, the others of another.
 3. GPs on the groups of outputs, from none and from all at once, by the change of one
    group at a time that helps most.
@@ -204,15 +204,17 @@ class Search:
         """Lets nominal structures grow and shrink by one term at a time."""
         for base in self._bases:
             self._consider_nominal(base, parent=None)
+        grown = list(self._bases)
         previous_best = None
         while self.best is not previous_best:
             previous_best = self.best
-            for structure in self._ranked(self._structures.values())[:_BEAM]:
-                if self.score(structure) > self.score(previous_best) + _CLOSE:
-                    continue
+            for structure in grown:
                 for neighbour in self._neighbours(structure):
                     if neighbour.key not in self._structures:
                         self._consider_nominal(neighbour, parent=structure)
+            most = self.score(self.best) + _CLOSE
+            ranked = self._ranked(self._structures.values())[:_BEAM]
+            grown = [one for one in ranked if self.score(one) <= most]
 
     def _neighbours(self, structure: Structure) -> list[Structure]:
         """Returns a nominal structure with one addition more, or one less."""
