@@ -109,7 +109,7 @@ def test_a_shell_takes_the_commands_of_a_page_as_they_stand(path):
         assert not checked.returncode, f"{text}\n{checked.stderr}"
         for words in lines(text):
             program = words[0]
-            assert Path(program).name in PROGRAMS or Path(program).parts[1:], words
+            assert Path(program).name in PROGRAMS or "/" in program, words
             if program == "gpmpc":
                 check_gpmpc(words[1:])
 
