@@ -149,7 +149,7 @@ def _made(config: DictConfig) -> Experiment:
         data=data,
         trajectory=instantiate(trajectory, _convert_="all"),
         system=system,
-        train=train,
+        train=train if model is None else None,
         controller=controller,
         plant=_system_of(config.plant) if config.plant else None,
         name=name,

@@ -250,7 +250,7 @@ def test_what_is_no_bag_is_refused_in_one_line(tmp_path):
 
 
 def test_a_chunk_of_ros_1_may_not_unfold_to_all_memory(tmp_path, monkeypatch):
-    zeros = bz2.compress(bytes(300_000_000))
+    zeros = bz2.compress(bytes(100_000_000))
     pack = rosbag1.writer.Writer.set_compression
 
     def set_bomb(writer, kind):

@@ -1,5 +1,7 @@
 """Vehicles, and systems of the user, are structures whose parameters a log tells."""
 
+import importlib.util
+import re
 import sys
 from pathlib import Path
 
@@ -42,6 +44,7 @@ from gpmpc.testing import check_model
 sys.path.append(str(Path(__file__).resolve().parents[2]))
 from tests.cli.command import forked
 
+ROOT = Path(__file__).resolve().parents[2]
 HEADING = {"columns": ["heading"], "kind": "angle", "unit": "rad"}
 POSITION = {"columns": ["x", "y"], "unit": "m"}
 CAR = {
@@ -416,3 +419,29 @@ def test_a_system_of_another_time_step_or_simulator_is_refused():
         nominal(lambda curvature: System(KinematicBicycle(curvature), 0.05))
     with pytest.raises(SettingError, match="cannot be made"):
         nominal(lambda: KinematicBicycle())
+
+
+def test_the_pages_systems_are_fitted_by_its_mappings(tmp_path, monkeypatch):
+    page = (ROOT / "docs" / "guide_log_systems.md").read_text()
+    for text in re.findall(r"```python\n(.*?)```", page, re.DOTALL):
+        (tmp_path / text.split()[1]).write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    for name in ("my_robot", "my_rod"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    whole, entry, vehicle = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    mapping = yaml.safe_load(whole)
+    table = flight(pendulum(), excitation(200, (0, 2.0), time_step=0.05))
+    columns = {"angle": "state.angle", "rate": "state.rate", "torque": "input.torque"}
+    table = table.rename(columns={"t": "time", **columns})
+    values, _ = fitted_values(log_of(tmp_path, table, mapping), steps=5)
+    assert values == pytest.approx({"mass": 1, "length": 1, "damping": 0.05}, rel=0.01)
+    values, _ = fitted_values(
+        log_of(tmp_path, table, {**mapping, **yaml.safe_load(entry)}), steps=5
+    )
+    assert values == pytest.approx({"mass": 1, "damping": 0.05}, rel=0.01)
+    assert LogMapping.from_dict(yaml.safe_load(vehicle)).model == "bicycle"
+    if importlib.util.find_spec("mujoco"):
+        nominal = {"system": "my_rod:make_rod", "fixed": {"folder": str(tmp_path)}}
+        slow = table.assign(time=0.02 * np.arange(200))
+        log = log_of(tmp_path, slow, {**mapping, "nominal": nominal})
+        assert bases(log)[0].name == "make_rod"
