@@ -20,7 +20,8 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import GPMPC, Decision, PredictionSettings, Problem, Reference, Timing
 from gpmpc.mpc._controller import read_parameters, read_reference
 from gpmpc.propagation import Propagator
-from gpmpc.qp import QPSolver
+from gpmpc.qp import QPSolution, QPSolver
+from gpmpc.qp import _record as layout
 from gpmpc.signals import Signals
 from gpmpc.status import Status
 
@@ -169,6 +170,8 @@ class CompiledController:
         memory = getattr(previous, "memory", None)
         if memory is not None:
             ctypes.memmove(ctypes.byref(kept), memory, ctypes.sizeof(kept))
+        elif previous.solution is not None:
+            _write_solution(kept.solution, previous.solution)
         view(kept.input)[:] = previous.input
         if previous.disturbance is not None:
             view(kept.disturbance)[:] = previous.disturbance
@@ -259,6 +262,19 @@ class CompiledLoop:
 def view(numbers: Any) -> Array:
     """Returns an array of C as one of NumPy that shares its memory."""
     return np.ctypeslib.as_array(numbers)
+
+
+def _write_solution(kept: Any, solution: QPSolution) -> None:
+    """Writes the last program's solution in Python to what the code starts from."""
+    n = len(solution.x)
+    M = len(solution.caps)
+    labels = layout.working_labels(solution.record, n, M)
+    kept.status = int(solution.record[layout.STATUS])
+    kept.rows = M - n
+    kept.working = len(labels)
+    view(kept.label)[: len(labels)] = labels
+    view(kept.multiplier)[:M] = solution.multipliers
+    view(kept.x)[:] = solution.x
 
 
 def _decision(kept: Any, input: Array, timing: Timing) -> Decision:

@@ -1030,34 +1030,57 @@ static real elastic_price(const gpmpc_problem *problem, const real *states,
     return 2 * (cost + beside) / larger(sum_missed, REAL(1e-12));
 }
 
-/* Solves the program once more with another price of the elastic rows, where the first
-   solution misses one of them. */
-static void lower_elastic_prices(gpmpc_controller *controller)
+/* Whether the solution was found, and keeps the elastic rows. */
+static int keeps_elastic_rows(const gpmpc_problem *problem,
+                              const gpmpc_solution *solution)
 {
-    static const real next_to_nothing = REAL(1e-9);
-    gpmpc_problem *problem = &controller->problem;
-    gpmpc_solution *solution = &controller->candidate;
     real inputs[GPMPC_SIZE];
     real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
-    real last_cost;
-    real price;
-    int e;
+    if (solution->status != GPMPC_SOLVED)
+        return 0;
     expand(problem, solution->x, inputs, states);
-    if (!(elastic_violation(problem, states, inputs) > KEPT))
-        return;
-    last_cost = cost_of_plan(problem, &problem->states[0][0], &problem->inputs[0][0]);
-    for (e = 0; e < r; e++)
-        if (row_is_elastic[e])
-            problem->prices[e] = next_to_nothing;
-    controller->elastic = *solution;
-    solve(&controller->program, problem->prices, &controller->elastic,
-          &controller->elastic);
-    expand(problem, controller->elastic.x, inputs, states);
-    price = elastic_price(problem, states, inputs, last_cost);
+    return elastic_violation(problem, states, inputs) <= KEPT;
+}
+
+/* Sets the price of the elastic rows. */
+static void set_elastic_price(gpmpc_problem *problem, real price)
+{
+    int e;
     for (e = 0; e < r; e++)
         if (row_is_elastic[e])
             problem->prices[e] = price;
+}
+
+/* Solves the program once more with another price of the elastic rows, where the first
+   solution misses one of them. Where the exact price took more digits than there are,
+   a thousandth of it may do: a row whose multiplier stays below is kept all the same. */
+static void lower_elastic_prices(gpmpc_controller *controller)
+{
+    gpmpc_problem *problem = &controller->problem;
+    gpmpc_solution *solution = &controller->candidate;
+    gpmpc_solution *free_solution = &controller->elastic;
+    real inputs[GPMPC_SIZE];
+    real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
+    real last_cost;
+    if (keeps_elastic_rows(problem, solution))
+        return;
+    if (solution->status != GPMPC_SOLVED) {
+        int e;
+        for (e = 0; e < r; e++)
+            if (row_is_elastic[e])
+                problem->prices[e] /= 1000;
+        solve(&controller->program, problem->prices, &controller->solution, solution);
+        if (keeps_elastic_rows(problem, solution))
+            return;
+    }
+    last_cost = cost_of_plan(problem, &problem->states[0][0], &problem->inputs[0][0]);
+    set_elastic_price(problem, REAL(1e-9)); /* next to nothing: rows keep their place */
+    solve(&controller->program, problem->prices, solution, free_solution);
+    expand(problem, free_solution->x, inputs, states);
+    set_elastic_price(problem, elastic_price(problem, states, inputs, last_cost));
     solve(&controller->program, problem->prices, solution, solution);
+    if (solution->status != GPMPC_SOLVED)
+        solve(&controller->program, problem->prices, free_solution, solution);
 }
 #endif
 
@@ -1187,8 +1210,7 @@ static int decide(gpmpc_controller *controller, const real *state,
     condense(controller);
     solve(&controller->program, problem->prices, &controller->solution, solution);
 #if GPMPC_ELASTIC
-    if (solution->status == GPMPC_SOLVED)
-        lower_elastic_prices(controller);
+    lower_elastic_prices(controller);
 #endif
     status = solution->status;
     if (!is_usable(controller))
