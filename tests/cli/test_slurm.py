@@ -8,10 +8,12 @@ import os
 import subprocess
 import sys
 
+import hydra
 import pytest
 
 from gpmpc.cli import _flying, _slurm
 from gpmpc.cli._flying import Flying
+from gpmpc.cli._settings import settings
 from gpmpc.cli._slurm import Slurm
 from gpmpc.exceptions import GpmpcError, SettingError
 from tests.cli.launched import fly, in_chunks, jobs_of
@@ -278,7 +280,7 @@ def test_a_refused_submission_is_one_line_and_leaves_nothing(fake, tree):
 
 
 @pytest.mark.parametrize(
-    ("settings", "words"),
+    ("arguments", "words"),
     [
         ({"timeout_min": 0}, r"timeout_min: must be a whole number"),
         ({"mem_gb": -1}, r"mem_gb: must be a number above 0"),
@@ -286,9 +288,22 @@ def test_a_refused_submission_is_one_line_and_leaves_nothing(fake, tree):
         ({"setup": "module load x"}, r"setup.* must be a list of lines"),
     ],
 )
-def test_a_mistake_in_slurms_settings_is_named(settings, words, fake, tree):
+def test_a_mistake_in_slurms_settings_is_named(arguments, words, fake, tree):
     with pytest.raises(SettingError, match=r"hydra\.launcher\." + words):
-        Slurm(tree, **settings)
+        Slurm(tree, **arguments)
+
+
+def test_the_page_s_settings_are_taken():
+    words = [
+        "launcher=slurm",
+        "hydra.launcher.additional_parameters={nice: 100}",
+        "hydra.launcher.setup=[module load python]",
+    ]
+    with settings():
+        launcher = hydra.compose("run", words, return_hydra_config=True).hydra.launcher
+    assert launcher.name == "slurm"
+    assert launcher.additional_parameters == {"nice": 100}
+    assert launcher.setup == ["module load python"]
 
 
 def test_without_slurm_its_launcher_says_where_to_start(tree, monkeypatch):
