@@ -107,7 +107,7 @@ def test_parameters_come_back_within_their_standard_errors(flights):
 def test_learning_finds_motors_and_noise_and_beats_baselines(flights):
     log = as_log(flights, gaps=(500,))
     train, held_out = log.split(["flight 2"])
-    learned = learn(train, points=20, steps=20)
+    learned = learn(train, points=20, steps=20, for_control=True)
     (chosen,) = [candidate for candidate in learned.candidates if candidate.chosen]
     assert "motor torque" in chosen.name
     judgement = judge(learned, held_out, train, steps=(1, 10, 20))
