@@ -137,6 +137,7 @@ def _made(config: DictConfig) -> Experiment:
     disturbances = instantiate(config.disturbances, _convert_="all")
     train = instantiate(config.model, _convert_="all")
     model = _saved_model(train, system)
+    training: Any = train if model is None else None
     if config.nominal and getattr(train, "predicts", None) != "difference":
         raise SettingError(
             "nominal", "needs model=difference_gp, which learns what it misses"
@@ -149,7 +150,7 @@ def _made(config: DictConfig) -> Experiment:
         data=data,
         trajectory=instantiate(trajectory, _convert_="all"),
         system=system,
-        train=train if model is None else None,
+        train=training,
         controller=controller,
         plant=_system_of(config.plant) if config.plant else None,
         name=name,
