@@ -24,7 +24,8 @@ from pathlib import Path
 
 from benchmarks.cluster import ray_nodes, slurm
 from benchmarks.cluster.acts import MANY, Act, Stage, ray_acts, run, slurm_acts
-from benchmarks.cluster.sweeps import Sweep
+from benchmarks.cluster.processes import kill, processes_with
+from benchmarks.cluster.sweeps import STAGE, Sweep
 
 _CLUSTERS = ("slurm", "slurm-accounting", "ray")
 
@@ -42,9 +43,12 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="gpmpc-cluster-") as name:
         folder = Path(name)
         folder.chmod(0o755)
-        stage = Stage(folder, _reference(folder, arguments.runs))
-        for cluster in arguments.on or _CLUSTERS:
-            rows += _play(cluster, stage, arguments.only)
+        try:
+            stage = Stage(folder, _reference(folder, arguments.runs))
+            for cluster in arguments.on or _CLUSTERS:
+                rows += _play(cluster, stage, arguments.only)
+        finally:
+            kill(processes_with(f"{STAGE}={folder}"))
     print()
     for where, act, outcome, seconds in rows:
         print(f"{where:17} {act:40} {seconds:5.0f} s  {outcome}")

@@ -15,7 +15,8 @@ from benchmarks.cluster.slow import SLOW
 from gpmpc.studies._run_folder import RunFolder, RunState
 
 ROOT = Path(__file__).resolve().parents[2]
-_MARK = "GPMPC_ACT"  # variable: the act that a process belongs to
+STAGE = "GPMPC_STAGE"  # variable: the folder of all acts that a process belongs to
+_MARK = "GPMPC_ACT"  # variable: the act that it belongs to
 _PATIENCE = 600.0  # for a sweep [s]
 _WORDS = [
     "system=double_integrator", "steps=2", "data.samples=25", "model.restarts=0",
@@ -59,7 +60,8 @@ class Sweep:
         path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
         marks = {
             SLOW: str(self.slow),
-            _MARK: self.folder.name,
+            STAGE: str(self.folder.parent),
+            _MARK: str(self.folder),
             "PYTHONPATH": path,
         }
         return subprocess.Popen(
@@ -135,7 +137,7 @@ class Sweep:
                 assert numbers == reference[seed], f"seed {seed} has other numbers"
         wait_for(
             f"no process of {self.folder.name}",
-            lambda: not processes_with(f"{_MARK}={self.folder.name}"),
+            lambda: not processes_with(f"{_MARK}={self.folder}"),
             60.0,
         )
 
