@@ -218,11 +218,11 @@ def test_a_run_says_where_the_users_own_code_has_changed(tmp_path):
         (["-m", "horizn=5,6"], "unknown setting 'horizn' (did you mean 'horizon'?)"),
         (
             ["controller=convx"],
-            "controller: no such option 'convx'; available are convex, lqr, nmpc",
+            "controller: no such option 'convx'; available are compiled, convex",
         ),
         (
             ["-m", "controller=lqr,convx"],
-            "controller: no such option 'convx'; available are convex, lqr, nmpc",
+            "controller: no such option 'convx'; available are compiled, convex",
         ),
         (["data=paper"], "data.folder: this setting has no default"),
         (["data=paper", "data.folder=nowhere"], "nowhere: no such folder"),
