@@ -107,8 +107,14 @@ def _fit_nominal_part(
 
 def _fit_affine(model: LogModel, log: Log, steps: int) -> LogModel:
     """Fits an affine nominal part one step ahead, and first-order lags on rollouts."""
+    nominal = model.nominal
+    assert isinstance(nominal, AffineNominal)
+    if not nominal.fitted and len(model.time_constants):
+        fitted = replace(model, nominal=replace(nominal, fitted=True))
+        lags = _fit_affine(fitted, log, steps).time_constants
+        return replace(model, time_constants=lags)
     if not len(model.time_constants):
-        return _fit_affine_part(model, log) if _is_fitted(model) else model
+        return _fit_affine_part(model, log) if nominal.fitted else model
     m = len(log.input_names)
     trials = _LagTrials(model, log, steps)
     candidates = [np.full(m, rows * log.time_step) for rows in _ROWS_OF_LAGS]
@@ -121,12 +127,6 @@ def _fit_affine(model: LogModel, log: Log, steps: int) -> LogModel:
             candidates.append(candidate)
         best = min(candidates, key=trials.cost)
     return trials.fit(best)
-
-
-def _is_fitted(model: LogModel) -> bool:
-    """Returns whether the affine nominal part has parameters."""
-    assert isinstance(model.nominal, AffineNominal)
-    return model.nominal.fitted
 
 
 class _LagTrials:

@@ -237,7 +237,7 @@ def _with_memory(memory: Memory) -> Callable[[LogModel], LogModel | None]:
         if not model.memory.empty:
             return None
         if isinstance(nominal, AffineNominal) and nominal.fitted:
-            return None  # the linear term has it all
+            nominal = replace(nominal, fitted=False)  # the linear term has it all
         no_history = (0,) * len(model.history)
         return replace(model, nominal=nominal, memory=memory, history=no_history)
 
@@ -295,8 +295,8 @@ def _alone(outputs: tuple[int, ...]) -> Callable[[LogModel], LogModel | None]:
 def _with_lags(inputs: int) -> Callable[[LogModel], LogModel | None]:
     def extend(model: LogModel) -> LogModel | None:
         nominal = model.nominal
-        is_affine = isinstance(nominal, AffineNominal)
-        if len(model.time_constants) or (is_affine and not nominal.fitted):
+        is_still = isinstance(nominal, AffineNominal) and not nominal.fitted
+        if len(model.time_constants) or (is_still and model.memory.empty):
             return None
         return replace(model, time_constants=np.zeros(inputs))
 
