@@ -466,7 +466,7 @@ def test_two_sweeps_share_a_tree(sweep, tmp_path):
 
 
 def test_failed_runs_are_named_and_stop_nothing(tmp_path):
-    swept = ["steps=1", "recorder=none", "data.size=8,12,99", "seed=0,1", "folder=t"]
+    swept = ["steps=1", "recorder=none", "data.size=12,16,99", "seed=0,1", "folder=t"]
     done = forked("run", "-m", *TINY, *swept, cwd=tmp_path)
     assert done.returncode == 1
     assert "6 runs: 4 flown, 0 finished before, 2 failed" in done.stdout
