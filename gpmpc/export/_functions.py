@@ -50,6 +50,7 @@ class FunctionWriter:
                     "{",
                     f"    real value[{count}];",
                     f"    real jacobian[{count * (n + m)}];",
+                    "    int i;",
                     f"    {name}(x, u, p, value, jacobian);",
                     f"    for (i = 0; i < {count}; i++) {{",
                     f"        h[{rows} + i] = value[i];",
@@ -63,7 +64,7 @@ class FunctionWriter:
             "static void constraints(const real *x, const real *u, const real *p,\n"
             "    real *h, real *E, real *D)"
         )
-        self._function(signature, ["int i;", *body], "h(x, u, p) <= 0")
+        self._function(signature, body, "h(x, u, p) <= 0")
 
     def _write_outputs(self, outputs: Sequence[Any]) -> None:
         """Writes the squares Z = [J, e]' W [J, e] of the outputs along a plan."""
