@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError
 from gpmpc.export._functions import FunctionWriter
 from gpmpc.export._text import Numbers
@@ -183,7 +184,7 @@ class CompiledController:
 
 
 def compiled_controller(
-    model: Any,
+    model: DynamicsModel,
     propagator: Propagator,
     problem: Problem,
     horizon: int,
