@@ -414,7 +414,13 @@ class Search:
     # 4. corrections by the past
 
     def _search_corrections(self) -> None:
-        """Considers corrections upon the best structures and upon a constant state."""
+        """Considers corrections upon the best structures and upon a constant state.
+
+        A memory holds the past already. A correction upon it follows the runs that it
+        was fitted to, and predicts others worse.
+        """
+        if not self.best.model.memory.empty:
+            return
         ranked = self._ranked(self._structures.values())
         for structure in ranked[:_CORRECTED]:
             self._consider_correction(structure)

@@ -75,7 +75,7 @@ def test_outputs_alone_are_learned_with_their_past(tmp_path):
     learned = learn(train, points=20, steps=40)
     model = learned.model
     assert not model.memory.empty
-    windows = held_out.windows(40, past=model.past)
+    windows = held_out.windows(40, past=45)
     dynamics = replace(model, correction=None)
     for steps in (10, 40):
         error = np.abs(dynamics.rollout_errors(windows, [steps])).mean()
