@@ -8,4 +8,4 @@ files), ``logs``, ``plotting``, ``studies``, ``experiments`` (the published resu
 ``cli``.
 """
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"

@@ -26,7 +26,7 @@ from gpmpc.exceptions import GpmpcError
 
 # Endings of the files that results depend on: code, models for simulators, printed
 # figures. Settings are no part of the code: every result names its own.
-_SOURCES = (".py", ".xml", ".csv")
+_SOURCES = (".py", ".xml", ".csv", ".c", ".h")
 _NO_SOURCES = ("__pycache__", "conf")  # folders
 # Of a user's own package: tables may stand beside the code that has written them.
 _OWN_SOURCES = (".py", ".xml")

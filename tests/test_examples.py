@@ -66,6 +66,7 @@ def test_the_example_of_a_custom_system_follows_its_waypoints(
     assert (tmp_path / "own_system.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_example_of_a_log_learns_and_leaves_a_figure(tmp_path, capsys):
     names = runpy.run_path(str(EXAMPLES / "own_log.py"))
     names["main"](tmp_path)

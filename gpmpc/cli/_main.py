@@ -24,6 +24,7 @@ from gpmpc.cli._settings import (
     model_file,
     nearest,
     settings,
+    working_folder,
 )
 from gpmpc.cli._terminal import print_error, redirected_output
 from gpmpc.exceptions import GpmpcError
@@ -62,6 +63,7 @@ def _run(words: Sequence[str], debug: bool) -> Result:
         arguments = _parse(name, command, words)
         if command.has_settings:
             return _run_with_settings(name, command, arguments)
+        working_folder()
         return _call(command.module, name, arguments)
     except KeyboardInterrupt:
         if _goes_on_where_it_stopped(name, command, words):

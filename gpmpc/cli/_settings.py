@@ -95,14 +95,23 @@ def find_modules_here() -> None:
     of somebody else's runs nothing of it. Hydra, which imports what is called like a
     plugin of its own, has looked for plugins before.
     """
+    here = working_folder()
+    if here not in sys.path:
+        sys.path.append(here)
+
+
+def working_folder() -> str:
+    """Returns the working folder.
+
+    Raises:
+        GpmpcError: It is gone; libraries that are loaded there may end the process.
+    """
     try:
-        here = os.getcwd()
+        return os.getcwd()
     except OSError as error:
         raise GpmpcError(
             "the working folder is gone; change to one that exists"
         ) from error
-    if here not in sys.path:
-        sys.path.append(here)
 
 
 def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:

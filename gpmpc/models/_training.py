@@ -72,8 +72,9 @@ def train(
     >>> from gpmpc.datasets import RandomData
     >>> from gpmpc.systems import pendulum
     >>> data = RandomData(samples=30).transitions(pendulum())
-    >>> train(data, system=pendulum()).posterior.residual.output_dim  # the rate alone
-    1
+    >>> model = train(data, system=pendulum()).posterior
+    >>> model.signals.state_names, model.angles
+    (('angle', 'rate'), [0])
     """
     check_transitions(transitions)
     check_choice("kinematics", kinematics, KINEMATICS)

@@ -92,7 +92,7 @@ def sign(value: Any, width: float) -> Any:
         width: In its unit: at plus or minus ``width`` the sign is 0.76, at twice that
             0.96.
 
-    >>> round(sign(0.02, width=0.01), 2)
+    >>> float(round(sign(0.02, width=0.01), 2))
     0.96
     """
     check_number("width", width, above=0)

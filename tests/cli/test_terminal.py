@@ -203,7 +203,7 @@ def test_help_and_tab_list_only_choices_that_the_command_has(tmp_path):
         ("gpmpc p", ["plot"]),
         ("gpmpc help rep", ["report"]),
         ("gpmpc run trajectory=l", ["trajectory=lorenz"]),
-        ("gpmpc run -m steps=3 controller=c", ["controller=convex"]),
+        ("gpmpc run -m steps=3 controller=conv", ["controller=convex"]),
         ("gpmpc run -m controller=convex,l", ["controller=convex,lqr"]),
         ("gpmpc run controller=nonlin", ["controller=nonlinear"]),
         ("gpmpc run noise.p", ["noise.process="]),

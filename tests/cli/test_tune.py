@@ -133,7 +133,7 @@ def test_a_flight_of_which_steps_are_lost_has_no_cost(tmp_path):
     path = tmp_path / "run.mcap"
     runs.record_run(path, steps=20)
     folder = SimpleNamespace(finished=True, path=tmp_path, result=dict)
-    cost = SimpleNamespace(Q=np.eye(6), R=np.eye(3), angles=())
+    cost = SimpleNamespace(Q=np.eye(6), R=np.eye(3), angle_indices=())
     controller = {"problem": SimpleNamespace(cost=cost), "initial_input": np.zeros(3)}
     assert _cost(SimpleNamespace(folder=folder), controller) > 0
     data = bytearray(path.read_bytes())

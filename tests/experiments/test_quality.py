@@ -100,7 +100,8 @@ def test_the_words_of_a_family_are_settings_of_a_run(family):
 def test_every_controller_and_propagation_of_the_settings_is_among_the_contenders():
     words = " ".join(family.words for family in FAMILIES)
     for controller in (CONF / "controller").glob("*.yaml"):
-        assert f"controller={controller.stem}" in words
+        if controller.stem != "compiled":  # it decides as the convex one does
+            assert f"controller={controller.stem}" in words
     for propagation in (CONF / "propagation").glob("*.yaml"):
         assert f"propagation={propagation.stem}" in words
 
