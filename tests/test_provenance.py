@@ -3,6 +3,7 @@
 import os
 import shutil
 import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -130,6 +131,8 @@ def test_the_fingerprint_is_read_once_a_process_and_is_quick():
 def own(tmp_path, monkeypatch):
     """Code of a user's own in a folder on the path, each file by its name."""
     monkeypatch.syspath_prepend(str(tmp_path))
+    for name in [name for name in sys.modules if name.startswith("my_")]:
+        monkeypatch.delitem(sys.modules, name)  # of another test, in its own folder
     (tmp_path / "my_robot").mkdir()
     files = {
         "my_robot/__init__.py": "",
