@@ -45,9 +45,7 @@ class Job:
     @property
     def done(self) -> bool:
         """Whether this sweep, or another one, has finished it or seen it fail."""
-        if self.folder.finished:
-            return True
-        return self.folder.failed_at not in (None, self.failed_before)
+        return self.folder.outcome_since(self.failed_before) is not None
 
     def with_absolute_path(self) -> "Job":
         """Returns the run as a process in any working folder finds it."""

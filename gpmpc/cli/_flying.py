@@ -7,7 +7,7 @@ What a process says of its runs is not believed: a run counts by its own folder 
 One that its process could not finish is a failed run with the reason in its
 ``error.json``, by the cause:
 
-- cancelled, or an error outside of any run: all runs of the chunk that are not finished;
+- cancelled, or an error outside of any run: all unfinished runs of the chunk;
 - wall time or memory: the run that was being flown. Those behind it fly again now;
 - a node, or the process, died: likewise, and the run that was being flown flies again,
   too, until it has had ``retries`` attempts more than the first.
@@ -134,7 +134,7 @@ class Flying:
                 continue
             self._begun_before[path] = job.folder.begun_at
             state = job.folder.state
-            if not self._settle(job, state) and state is not RunState.RUNNING:
+            if not self._settle(job) and state is not RunState.RUNNING:
                 to_fly.append(job)
         if not to_fly and not in_hand:
             return None
@@ -144,15 +144,13 @@ class Flying:
     def _unsettled(self, chunk: Chunk) -> list[Job]:
         """Settles jobs of a chunk; returns those that are not."""
         jobs = [self._open[path] for path in _paths(chunk) if path in self._open]
-        return [job for job in jobs if not self._settle(job, job.folder.state)]
+        return [job for job in jobs if not self._settle(job)]
 
-    def _settle(self, job: Job, state: RunState) -> bool:
+    def _settle(self, job: Job) -> bool:
         """Takes a job off the list where it has finished, or failed in this call."""
         path = str(job.folder.path)
-        if state is RunState.FAILED:
-            if job.folder.failed_at == self._failed_before[path]:
-                return False
-        elif state is not RunState.FINISHED:
+        state = job.folder.outcome_since(self._failed_before[path])
+        if state is None:
             return False
         del self._open[path]
         self.on_settled(job, state)
@@ -195,7 +193,7 @@ class Flying:
             self.repeated.add(path)
             self._failed_before[path] = job.folder.failed_at
             return
-        self._settle(job, job.folder.state)
+        self._settle(job)
 
     @cached_property
     def _provenance(self) -> dict[str, Any]:
@@ -224,7 +222,7 @@ class Flying:
         os.listdir(job.folder.path.parent)
         if str(job.folder.path) not in self._open:
             return True
-        return self._settle(job, job.folder.state)
+        return self._settle(job)
 
 
 def _paths(chunk: Chunk) -> list[str]:

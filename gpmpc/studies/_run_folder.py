@@ -125,6 +125,19 @@ class RunFolder:
         except FileNotFoundError:
             return None
 
+    def outcome_since(self, failed_before: int | None) -> RunState | None:
+        """Returns FINISHED or FAILED; None where the run has not ended.
+
+        Args:
+            failed_before: When an attempt failed that does not count [ns]; None where
+                every one does.
+        """
+        if self.finished:
+            return RunState.FINISHED
+        if self.failed_at not in (None, failed_before):
+            return RunState.FAILED
+        return None
+
     @property
     def ended_at(self) -> int | None:
         """When the last attempt finished or failed [ns]; None where it did not."""
