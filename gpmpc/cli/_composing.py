@@ -204,10 +204,8 @@ def _text(config: DictConfig) -> str:
 
 def _fingerprint(config: DictConfig, options: Mapping[str, Any]) -> str | None:
     """Returns a text that differs where settings do, those set aside left out."""
-    kept = OmegaConf.masked_copy(
-        config, [str(key) for key in config if key not in ASIDE]
-    )
-    text = _text(kept)
+    keys = [str(key) for key in config if key not in ASIDE]
+    text = _text(OmegaConf.masked_copy(config, keys))
     if _RESOLVER.search(text):
         return None
     content = json.dumps([text, chosen_options(options)])

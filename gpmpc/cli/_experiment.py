@@ -47,7 +47,7 @@ _CHOICES = {
 
 def experiment_of(config: DictConfig) -> Experiment:
     """Makes the objects that a user's settings describe; they may call anything."""
-    return _made(_merged(DictConfig(plain_data(config))))
+    return _build(_merge(DictConfig(plain_data(config))))
 
 
 def experiment_of_file(settings: dict[str, Any], trusted: Sequence[str]) -> Experiment:
@@ -60,8 +60,8 @@ def experiment_of_file(settings: dict[str, Any], trusted: Sequence[str]) -> Expe
     Raises:
         DataError: They call something else.
     """
-    merged = plain_data(_merged(DictConfig(settings)))
-    return _made(DictConfig(checked_settings(merged, trusted)))
+    merged = plain_data(_merge(DictConfig(settings)))
+    return _build(DictConfig(checked_settings(merged, trusted)))
 
 
 def plain_data(config: DictConfig) -> dict[str, Any]:
@@ -81,8 +81,8 @@ def plain_settings(config: DictConfig, options: Mapping[str, Any]) -> dict[str, 
     path = settings["model"].get("path")
     if path:
         settings["model"]["sha256"] = model_fingerprint(path)
-    kept = {key: value for key, value in settings.items() if key not in ASIDE}
-    return kept | {"options": chosen_options(options)}
+    settings = {key: value for key, value in settings.items() if key not in ASIDE}
+    return settings | {"options": chosen_options(options)}
 
 
 def model_fingerprint(path: str) -> str:
@@ -95,7 +95,7 @@ def chosen_options(options: Mapping[str, Any]) -> dict[str, Any]:
     return {group: options.get(group) for group in _GROUPS}
 
 
-def _merged(config: DictConfig) -> DictConfig:
+def _merge(config: DictConfig) -> DictConfig:
     """Checks settings and completes their parts, each as it will be called.
 
     A nominal system and a plant are whole systems, the controller has its propagator
@@ -123,7 +123,7 @@ def _merged(config: DictConfig) -> DictConfig:
     return config
 
 
-def _made(config: DictConfig) -> Experiment:
+def _build(config: DictConfig) -> Experiment:
     """Makes the objects of merged settings."""
     system = _system_of(config.system)
     if config.nominal:

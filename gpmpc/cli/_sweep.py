@@ -83,7 +83,7 @@ class Sweep:
         self.warnings: dict[Path, str] = {}
         #: folders of runs that were flown again, since their process was ended
         self.flown_again: set[str] = set()
-        #: attempts of runs that were ended too often, and are not flown again, by folder
+        #: attempts of runs that were ended too often, by folder; they do not fly again
         self.given_up: dict[str, int] = {}
 
     def close(self) -> None:
