@@ -46,7 +46,8 @@ _CLASSES = {
     "slurm": ("_slurm", "Slurm"),
     "ray": ("_ray", "Ray"),
 }
-Work = Callable[[Any], object]  # flies a chunk; of a module, so that it can be pickled
+# Flies a chunk, and returns its remarks; of a module, so that it can be pickled.
+Work = Callable[[Any], Sequence[str]]
 
 
 class Cause(Enum):
@@ -73,6 +74,8 @@ class ChunkEnd:
     cause: Cause | None = None
     #: the cause in a line
     reason: str = ""
+    #: what the user is to know of its flights
+    remarks: Sequence[str] = ()
 
 
 class Launcher(Protocol):
@@ -141,11 +144,11 @@ class Basic:
     def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
         for chunk in chunks:
             try:
-                work(chunk)
+                remarks = work(chunk)
             except Exception as error:
                 yield _end_by(error, chunk)
             else:
-                yield ChunkEnd(chunk, socket.gethostname())
+                yield ChunkEnd(chunk, socket.gethostname(), remarks=remarks)
 
     def close(self) -> None:
         pass
@@ -196,7 +199,8 @@ class Joblib:
                     if isinstance(error, Exception):
                         yield _end_by(error, chunk)
                     else:
-                        yield ChunkEnd(chunk, socket.gethostname())
+                        host = socket.gethostname()
+                        yield ChunkEnd(chunk, host, remarks=future.result())
         finally:
             for _, executor in flying.values():
                 executor.shutdown(wait=False, kill_workers=True)

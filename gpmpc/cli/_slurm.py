@@ -69,7 +69,9 @@ _GIVEN_UP = (
     "JobHoldMaxRequeue",
     "DependencyNeverSatisfied",
 )
-_OWN_ERROR = re.compile(r"^gpmpc: error: (.+)$", re.MULTILINE)  # of ``_slurm_job``
+# What ``_slurm_job`` prints.
+_OWN_ERROR = re.compile(r"^gpmpc: error: (.+)$", re.MULTILINE)
+_REMARK = re.compile(r"^gpmpc: remark: (.+)$", re.MULTILINE)
 
 
 class _Job(NamedTuple):
@@ -317,7 +319,8 @@ class Slurm:
         cause = _cause(job, log)
         host = job.host if job else _done_on(log or "")
         if cause is None:
-            return ChunkEnd(array.chunks[index], host)
+            remarks = _REMARK.findall(log or "")
+            return ChunkEnd(array.chunks[index], host, remarks=remarks)
         on_host = f" on {host}" if host else ""
         reason = self._reason(cause, job, log)
         number = job.number if job else f"{array.name}_{index}"

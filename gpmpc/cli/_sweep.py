@@ -46,6 +46,7 @@ from gpmpc.studies._run_folder import (
     of_other_code,
 )
 from gpmpc.studies._run_record import DAMAGE, warning_of
+from gpmpc.studies._sweep_status import without_numbers
 
 _MEASURED = 20  # finished runs whose times tell how long others take
 _LOOKS = 1000  # at folders whenever the bar is drawn
@@ -85,6 +86,7 @@ class Sweep:
         self.flown_again: set[str] = set()
         #: attempts of runs that were ended too often, by folder; they do not fly again
         self.given_up: dict[str, int] = {}
+        self._remarks: set[str] = set()  # that were printed, without their numbers
 
     def close(self) -> None:
         """Ends the processes that wait for more runs."""
@@ -109,7 +111,10 @@ class Sweep:
         finished = []
         waiting = []
         for job in jobs:
-            (finished if job.folder.finished else waiting).append(job)
+            if job.folder.finished:
+                finished.append(job)
+            else:
+                waiting.append(job)
         with report_compilation():
             for job in self._examples.of(waiting):
                 experiment_of(job.settings.config())
@@ -124,10 +129,11 @@ class Sweep:
 
     def _check_finished(self, job: Job) -> None:
         """Compares a run's settings, once: the index says with what it was compared."""
-        asked = job.settings.fingerprint()
+        fingerprint = job.settings.fingerprint()
         path = job.folder.path / METRICS
-        found, record = self._index.asked(path)
-        if record is not None and asked is not None and found == asked:
+        fingerprint_then, record = self._index.asked(path)
+        is_same = fingerprint is not None and fingerprint == fingerprint_then
+        if record is not None and is_same:
             warning = record.warning
             other_code = "" if record.is_of_this_code() else record.made_by
         else:
@@ -135,7 +141,7 @@ class Sweep:
             result = job.folder.result(plain_settings(config, job.settings.options))
             warning = warning_of(result)
             other_code = of_other_code(result)
-            self._add_to_index(path, result, asked)
+            self._add_to_index(path, result, fingerprint)
         if warning:
             self.warnings[job.folder.path] = warning
         if other_code:
@@ -163,11 +169,19 @@ class Sweep:
             chunked=self._chunking.chunks,
             on_settled=settle,
             retries=self.config.retries,
+            on_remark=self._print_remark,
         )
         flying.fly(job.with_absolute_path() for job in jobs if not job.folder.finished)
         self.flown_again |= {*flying.tried_again, *flying.repeated}
         self.given_up |= flying.given_up
         return outcomes
+
+    def _print_remark(self, remark: str) -> None:
+        """Prints what a flight has to say, once for all that differ in numbers."""
+        kind = without_numbers(remark)
+        if kind not in self._remarks:
+            self._remarks.add(kind)
+            print_error(remark)
 
     def _outcome(self, job: Job, state: RunState) -> JobOutcome:
         """Reads how a run ended, for the index, too; its warning is noted."""

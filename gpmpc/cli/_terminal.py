@@ -130,6 +130,34 @@ def logging_console() -> "Console":
     return console
 
 
+class _Remarks(logging.Handler):
+    """Keeps warnings, each text once."""
+
+    def __init__(self):
+        super().__init__(logging.WARNING)
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = " ".join(record.getMessage().split())
+        if text not in self.texts:
+            self.texts.append(text)
+
+
+@contextmanager
+def collected_remarks() -> Iterator[list[str]]:
+    """Keeps the package's warnings from the screen; yields the list they go to."""
+    log = logging.getLogger("gpmpc")
+    remarks = _Remarks()
+    propagate = log.propagate
+    log.addHandler(remarks)
+    log.propagate = False
+    try:
+        yield remarks.texts
+    finally:
+        log.propagate = propagate
+        log.removeHandler(remarks)
+
+
 def progress_bar(
     console: "Console", completed: Callable[[], int] | None = None
 ) -> "Progress":

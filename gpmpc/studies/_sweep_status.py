@@ -29,9 +29,8 @@ from gpmpc.studies._run_folder import (
 )
 
 _RATE_WINDOW = 600.0  # ends that tell how fast runs end now [s]
-_STILL = (
-    60.0  # behind the last end, after which nobody works, where no lock is held [s]
-)
+# Behind the last end, after which nobody works, where no lock is held [s].
+_STILL = 60.0
 _SHOWN_REASONS = 3
 
 
@@ -140,7 +139,7 @@ class SweepWatch:
                 ends.append(1e-9 * ended)
                 if state is RunState.FAILED:
                     reason = self._reason(path, ended)
-                    kind = re.sub(r"\d+", "0", reason)
+                    kind = without_numbers(reason)
                     failures[kind] += 1
                     examples[kind] = min(reason, examples.get(kind, reason))
         if not any(counts.values()):
@@ -186,6 +185,11 @@ class SweepWatch:
         if self._reasons.get(path, (None,))[0] != written:
             self._reasons[path] = written, RunFolder(Path(path)).error()
         return self._reasons[path][1]
+
+
+def without_numbers(text: str) -> str:
+    """Returns a text that is the same for texts that differ in numbers alone."""
+    return re.sub(r"\d+", "0", text)
 
 
 def _sweeps(tree: str) -> Iterator[str]:

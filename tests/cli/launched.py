@@ -49,6 +49,7 @@ def fly(chunk):
                     fly_one(job)
         except Busy:
             continue
+    return []
 
 
 def fly_one(job):

@@ -1,5 +1,6 @@
 """Runs of a sweep in chunks: how many a process flies, and which are tried before."""
 
+import logging
 import os
 
 import hydra
@@ -111,6 +112,22 @@ def test_a_chunk_goes_on_behind_what_cannot_be_flown(tmp_path, monkeypatch):
     flown.clear()
     fly_chunk(Chunk(tuple(jobs[:1]) + tuple(jobs[4:]), most_work=0.0))
     assert flown == [0]  # it always flies one
+
+
+def test_a_chunk_returns_its_remarks_and_prints_none(tmp_path, monkeypatch, capfd):
+    jobs = jobs_of(tmp_path, "seed=range(3)")
+    log = logging.getLogger("gpmpc.gp")
+
+    def run(settings, wait):
+        log.info("trained")
+        log.warning("few rows")
+        log.warning("seed\n%d", settings.config.seed % 2)
+
+    monkeypatch.setattr(_chunks, "run_one", run)
+    remarks = fly_chunk(Chunk(tuple(jobs), None))
+    assert remarks == ["few rows", "seed 0", "seed 1"]
+    assert capfd.readouterr() == ("", "")
+    assert logging.getLogger("gpmpc").handlers == []
 
 
 def test_every_choice_and_both_ends_are_tried(tmp_path):

@@ -139,7 +139,7 @@ def test_a_run_whose_node_or_worker_died_flies_again(name, ray, tmp_path):
 
 def test_a_node_that_does_not_see_the_folder_is_named(ray, tmp_path):
     (job,) = jobs_of(tmp_path, "flies")
-    assert flown(tmp_path, [job], work=lambda chunk: None) == ["failed"]
+    assert flown(tmp_path, [job], work=lambda chunk: []) == ["failed"]
     error = json.loads((job.folder.path / "error.json").read_text())
     assert error["host"].endswith("(10.0.0.7)")
     assert "says that it flew this run, and it is not in the folder" in error["error"]

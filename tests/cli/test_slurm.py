@@ -215,13 +215,10 @@ def test_jobs_are_submitted_as_arrays_that_slurm_takes(fake, tree):
     assert script[-1].endswith('"$SLURM_ARRAY_TASK_ID"')
 
 
-def test_a_job_flies_its_chunk_and_says_so(fake, tree):
-    (job,) = jobs_of(tree, "flies")
-    (chunk,) = in_chunks(1)([job])
-    launcher = Slurm(tree)
-    launcher.launch(fly, [chunk])
+def run_job(fake):
+    """Runs the script of the newest array as its first job."""
     path = os.pathsep.join(filter(None, sys.path))
-    done = subprocess.run(
+    return subprocess.run(
         ["/bin/sh"],
         input=(fake / "script").read_text(),
         env=os.environ | {"SLURM_ARRAY_TASK_ID": "0", "PYTHONPATH": path},
@@ -229,8 +226,33 @@ def test_a_job_flies_its_chunk_and_says_so(fake, tree):
         capture_output=True,
         check=True,
     )
+
+
+def test_a_job_flies_its_chunk_and_says_so(fake, tree):
+    (job,) = jobs_of(tree, "flies")
+    (chunk,) = in_chunks(1)([job])
+    launcher = Slurm(tree)
+    launcher.launch(fly, [chunk])
+    done = run_job(fake)
     assert done.stderr.startswith("gpmpc: done on ")
     assert job.folder.finished
+
+
+def fly_with_remark(chunk):
+    return [*fly(chunk), "few rows"]
+
+
+def test_the_remarks_of_a_job_come_from_its_log(fake, tree):
+    (chunk,) = in_chunks(1)(jobs_of(tree, "flies"))
+    launcher = Slurm(tree)
+    ends = launcher.launch(fly_with_remark, [chunk])
+    done = run_job(fake)
+    assert done.stderr.startswith("gpmpc: remark: few rows\ngpmpc: done on ")
+    (array,) = (tree / ".slurm").glob("gpmpc-*")
+    (array / "0.log").write_text(done.stderr)
+    (fake / "queue").write_text("0|COMPLETED|None|n1\n")
+    (end,) = ends
+    assert (end.cause, end.remarks) == (None, ["few rows"])
 
 
 def test_the_jobs_of_a_killed_sweep_are_watched_and_not_flown_twice(fake, tree):

@@ -372,6 +372,8 @@ def test_every_launcher_gives_the_same_numbers(launcher, sweep, tmp_path):
     done = gpmpc(*SWEPT, "folder=tree", f"launcher={launcher}", *capped, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "4/4" in done.stdout
+    # Both runs of ten rows would say it.
+    assert done.stderr.count("fewer than a plane needs") == 1
     assert results(tmp_path / "tree") == sweep[1]
 
 
