@@ -23,8 +23,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from benchmarks.cluster import ray_nodes, slurm
-from benchmarks.cluster.acts import MANY, Act, Stage, ray_acts, run, slurm_acts
-from benchmarks.cluster.processes import kill, processes_with
+from benchmarks.cluster.acts import MANY, Act, RayActs, SlurmActs, Stage, run
+from benchmarks.cluster.processes import kill, processes_with, running
 from benchmarks.cluster.sweeps import STAGE, Sweep
 
 _CLUSTERS = ("slurm", "slurm-accounting", "ray")
@@ -78,9 +78,9 @@ def _play(cluster: str, stage: Stage, only: str) -> list[tuple[str, str, str, fl
         print(f"{cluster}: not here: {', '.join(missing)}", flush=True)
         return []
     if cluster == "ray":
-        return run(_chosen(ray_acts(stage), only), cluster)
-    with slurm.Slurm(stage.folder / cluster, accounting) as nodes:
-        return run(_chosen(slurm_acts(stage, nodes), only), cluster)
+        return run(_chosen(RayActs(stage).by_name(), only), cluster)
+    with running(slurm.Slurm(stage.folder / cluster, accounting)) as nodes:
+        return run(_chosen(SlurmActs(stage, nodes).by_name(), only), cluster)
 
 
 def _chosen(acts: Mapping[str, Act], only: str) -> dict[str, Act]:

@@ -3,11 +3,12 @@
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.cluster.processes import running
 from benchmarks.cluster.ray_nodes import RayNodes
 from benchmarks.cluster.slow import SLOW
 from benchmarks.cluster.slurm import Slurm
@@ -30,214 +31,257 @@ class Stage:
     reference: Mapping[int, Any]
 
 
-def slurm_acts(stage: Stage, slurm: Slurm) -> dict[str, Act]:
-    """Returns the acts on Slurm, by what they show."""
+class SlurmActs:
+    """What Slurm does to sweeps.
 
-    def sweep(name: str, runs: int = _FEW, **more: Any) -> Sweep:
-        return Sweep(
-            folder=stage.folder / f"{slurm.folder.name}-{name}",
-            runs=runs,
-            kinds=more.pop("kinds", ["Slow"]),
-            launcher=[*_SLURM, *more.pop("words", ["chunk=1"])],
-            environment=slurm.environment,
-            **more,
-        )
+    Args:
+        stage: Where the acts take place.
+        slurm: The cluster, which is running.
+    """
 
-    def jobs(name: str) -> dict[int, str]:
-        """Returns the state of the newest array of a sweep, by number of the job."""
-        (folder,) = [*(stage.folder / name / ".slurm").glob("gpmpc-*")]
-        listed = slurm.ask(
-            "squeue", "--noheader", "--array", f"--name={folder.name}",
-            "--states=all", "--format=%K|%F_%K|%T|%N",
-        )  # fmt: skip
-        rows = [line.split("|") for line in listed.splitlines()]
-        return {int(index): "|".join(row) for index, *row in rows}
+    def __init__(self, stage: Stage, slurm: Slurm):
+        self._stage = stage
+        self._slurm = slurm
 
-    def number(name: str, state: str) -> str:
-        """Returns the number of a job in a state."""
-        rows = [row.split("|") for row in jobs(name).values()]
-        return next(row[0] for row in rows if row[1] == state)
+    def by_name(self) -> dict[str, Act]:
+        """Returns the acts, by what they show."""
+        return {
+            f"{MANY} runs over two nodes": self._many,
+            "scancel of a running and a pending job": self._two_cancelled,
+            "scancel of a whole array": self._all_cancelled,
+            "a job over its memory": self._memory,
+            "a job over its wall time": self._wall_time,
+            "a node killed": self._node,
+            "the driver killed and called again": self._driver,
+            "two drivers on one sweep": self._two_drivers,
+            "a node without the folder": self._blind,
+        }
 
-    def many() -> None:
-        act = sweep("many", MANY, words=["chunk=10"])
+    def _many(self) -> None:
+        act = self._sweep("many", MANY, words=["chunk=10"])
         code, _ = act.fly()
-        hosts = {row.split("|")[2] for row in jobs(act.folder.name).values()}
+        hosts = {row.split("|")[2] for row in self._jobs(act).values()}
         assert hosts == {"n1", "n2"}, hosts
-        act.check(code, stage.reference)
+        act.check(code, self._stage.reference)
 
-    def cancelled(name: str, cancel: Callable[[str], None], failed: int) -> None:
-        act = sweep(name, slow=_SLOW)
-        process = act.start()
-        act.wait_for(4, RunState.RUNNING)
-        cancel(act.folder.name)
-        code, _ = end_of(process)
-        act.check(code, stage.reference)
+    def _two_cancelled(self) -> None:
+        def cancel() -> None:
+            for state in ("RUNNING", "PENDING"):
+                self._slurm.ask("scancel", self._number(act, state))
+
+        act = self._sweep("cancelled", slow=_SLOW)
+        self._cancelled(act, cancel, failed=2)
+
+    def _all_cancelled(self) -> None:
+        def cancel() -> None:
+            array = self._number(act, "RUNNING").partition("_")[0]
+            self._slurm.ask("scancel", array)
+
+        act = self._sweep("array", slow=_SLOW)
+        self._cancelled(act, cancel, failed=_FEW)
+
+    def _cancelled(self, act: Sweep, cancel: Act, failed: int) -> None:
+        code, _ = _fly_through(act, 4, cancel)
+        act.check(code, self._stage.reference)
         kinds = [error["kind"] for error in act.errors()]
         assert kinds == failed * ["cancelled"], kinds
         act.slow = 0.0
         code, printed = act.fly()
         assert code == 0, printed
         assert f"{failed} of the runs were flown again" in printed
-        act.check(code, stage.reference)
+        act.check(code, self._stage.reference)
 
-    def cancel_two(name: str) -> None:
-        for state in ("RUNNING", "PENDING"):
-            slurm.ask("scancel", number(name, state))
-
-    def cancel_all(name: str) -> None:
-        slurm.ask("scancel", number(name, "RUNNING").partition("_")[0])
-
-    def memory() -> None:
-        act = sweep("memory", 2, kinds=["Slow", "Hungry"])
+    def _memory(self) -> None:
+        act = self._sweep("memory", 2, kinds=["Slow", "Hungry"])
         code, printed = act.fly()
-        act.check(code, stage.reference)
+        act.check(code, self._stage.reference)
         errors = act.errors()
         assert [error["kind"] for error in errors] == 2 * ["memory"], errors
         assert "hydra.launcher.mem_gb" in printed
         code, printed = act.fly("retries=0")
         assert "2 of the runs were ended by a cluster or a crash" in printed, printed
-        act.check(code, stage.reference)
+        act.check(code, self._stage.reference)
 
-    def wall_time() -> None:
+    def _wall_time(self) -> None:
         words = ["chunk=1", "hydra.launcher.timeout_min=1"]
-        act = sweep("time", 1, kinds=["Slow", "Stuck"], words=words)
+        act = self._sweep("time", 1, kinds=["Slow", "Stuck"], words=words)
         code, printed = act.fly()
-        act.check(code, stage.reference)
+        act.check(code, self._stage.reference)
         assert [error["kind"] for error in act.errors()] == ["time"]
         assert "hydra.launcher.timeout_min" in printed
 
-    def node() -> None:
-        act = sweep("node", slow=_SLOW)
-        process = act.start()
-        act.wait_for(4, RunState.RUNNING)
-        slurm.kill_node("n1")
-        code, printed = end_of(process)
+    def _node(self) -> None:
+        act = self._sweep("node", slow=_SLOW)
+        code, printed = _fly_through(act, 4, lambda: self._slurm.kill_node("n1"))
         assert code == 0, printed
-        act.check(code, stage.reference)
-        slurm.start_node("n1")
-        slurm.wait_until_idle()
+        act.check(code, self._stage.reference)
+        self._slurm.start_node("n1")
+        self._slurm.wait_until_idle()
 
-    def driver() -> None:
-        act = sweep("driver", slow=_SLOW)
-        process = act.start()
-        act.wait_for(4, RunState.RUNNING)
-        process.kill()
-        process.communicate()
-        code, printed = act.fly()
+    def _driver(self) -> None:
+        act = self._sweep("driver", slow=_SLOW)
+        code, printed = _kill_and_repeat(act, 4)
         assert code == 0, printed
-        assert len(jobs(act.folder.name)) == _FEW  # of one array
-        act.check(code, stage.reference)
+        assert len(self._jobs(act)) == _FEW  # of one array
+        act.check(code, self._stage.reference)
 
-    def two() -> None:
-        act = sweep("two", slow=2.0)
-        ends = [end_of(process) for process in [act.start(), act.start()]]
-        assert [code for code, _ in ends] == [0, 0], ends
-        assert len(jobs(act.folder.name)) == _FEW
-        act.check(0, stage.reference)
+    def _two_drivers(self) -> None:
+        act = self._sweep("two", slow=2.0)
+        _start_twice(act)
+        assert len(self._jobs(act)) == _FEW
+        act.check(0, self._stage.reference)
 
-    def blind() -> None:
-        act = sweep("blind", slow=2.0)
+    def _blind(self) -> None:
+        act = self._sweep("blind", slow=2.0)
         act.folder.mkdir()
-        slurm.kill_node("n2")
-        slurm.start_node("n2", blind_to=act.folder)
-        time.sleep(15.0)  # until the controller has noticed
-        slurm.wait_until_idle()
+        self._restart_second_node(blind_to=act.folder)
         code, printed = act.fly()
-        act.check(code, stage.reference)
+        act.check(code, self._stage.reference)
         errors = act.errors()
         assert errors, printed
         assert all(error["host"] == "n2" for error in errors), errors
-        slurm.kill_node("n2")
-        slurm.start_node("n2")
-        time.sleep(15.0)
-        slurm.wait_until_idle()
+        self._restart_second_node()
 
-    return {
-        f"{MANY} runs over two nodes": many,
-        "scancel of a running and a pending job": lambda: cancelled(
-            "cancelled", cancel_two, 2
-        ),
-        "scancel of a whole array": lambda: cancelled("array", cancel_all, _FEW),
-        "a job over its memory": memory,
-        "a job over its wall time": wall_time,
-        "a node killed": node,
-        "the driver killed and called again": driver,
-        "two drivers on one sweep": two,
-        "a node without the folder": blind,
-    }
+    def _restart_second_node(self, blind_to: Path | None = None) -> None:
+        self._slurm.kill_node("n2")
+        self._slurm.start_node("n2", blind_to)
+        time.sleep(15.0)  # until the controller has noticed
+        self._slurm.wait_until_idle()
 
-
-def ray_acts(stage: Stage) -> dict[str, Act]:
-    """Returns the acts on Ray, by what they show."""
-
-    def sweep(name: str, nodes: RayNodes, runs: int = _FEW, **more: Any) -> Sweep:
-        address = f"hydra.launcher.ray.init.address={nodes.address}"
+    def _sweep(
+        self,
+        name: str,
+        runs: int = _FEW,
+        kinds: Sequence[str] = ("Slow",),
+        words: Sequence[str] = ("chunk=1",),
+        slow: float = 0.0,
+    ) -> Sweep:
         return Sweep(
-            folder=stage.folder / f"ray-{name}",
+            folder=self._stage.folder / f"{self._slurm.folder.name}-{name}",
             runs=runs,
-            kinds=["Slow"],
-            launcher=["launcher=ray", address, *more.pop("words", ["chunk=1"])],
-            environment=nodes.environment,
-            **more,
+            kinds=kinds,
+            launcher=[*_SLURM, *words],
+            environment=self._slurm.environment,
+            slow=slow,
         )
 
-    def cluster(name: str, slow: float = 0.0, blind_to: Path | None = None) -> RayNodes:
-        folder = Path(tempfile.gettempdir()) / f"gpmpc-ray-{name}"
-        return RayNodes(folder, blind_to, {SLOW: str(slow)})
+    def _jobs(self, act: Sweep) -> dict[int, str]:
+        """Returns the state of the only array of a sweep, by number of the job."""
+        (folder,) = (act.folder / ".slurm").glob("gpmpc-*")
+        listed = self._slurm.ask(
+            "squeue", "--noheader", "--array", f"--name={folder.name}",
+            "--states=all", "--format=%K|%F_%K|%T|%N",
+        )  # fmt: skip
+        rows = [line.split("|") for line in listed.splitlines()]
+        return {int(index): "|".join(row) for index, *row in rows}
 
-    def many() -> None:
-        with cluster("many") as nodes:
-            act = sweep("many", nodes, MANY, words=["chunk=10"])
-            code, printed = act.fly()
-            assert code == 0, printed
-            act.check(code, stage.reference)
+    def _number(self, act: Sweep, state: str) -> str:
+        """Returns the number of a job in a state."""
+        rows = [row.split("|") for row in self._jobs(act).values()]
+        return next(row[0] for row in rows if row[1] == state)
 
-    def raylet() -> None:
-        with cluster("raylet", slow=_SLOW) as nodes:
-            act = sweep("raylet", nodes)
-            process = act.start()
-            act.wait_for(3, RunState.RUNNING)
-            nodes.kill_node("second")
-            code, printed = end_of(process)
-            assert code == 0, printed
-            act.check(code, stage.reference)
 
-    def driver() -> None:
-        with cluster("driver", slow=_SLOW) as nodes:
-            act = sweep("driver", nodes)
-            process = act.start()
-            act.wait_for(3, RunState.RUNNING)
-            process.kill()
-            process.communicate()
-            code, printed = act.fly()
-            assert code == 0, printed
-            act.check(code, stage.reference)
+class RayActs:
+    """What Ray does to sweeps, each on a cluster of its own.
 
-    def two() -> None:
-        with cluster("two") as nodes:
-            act = sweep("two", nodes)
-            ends = [end_of(process) for process in [act.start(), act.start()]]
-            assert [code for code, _ in ends] == [0, 0], ends
-            act.check(0, stage.reference)
+    Args:
+        stage: Where the acts take place.
+    """
 
-    def blind() -> None:
-        folder = stage.folder / "ray-blind"
+    def __init__(self, stage: Stage):
+        self._stage = stage
+
+    def by_name(self) -> dict[str, Act]:
+        """Returns the acts, by what they show."""
+        return {
+            f"{MANY} runs over two nodes": self._many,
+            "a raylet killed": self._raylet,
+            "the driver killed and called again": self._driver,
+            "two drivers on one sweep": self._two_drivers,
+            "a node without the folder": self._blind,
+        }
+
+    def _many(self) -> None:
+        with running(_ray_nodes("many")) as nodes:
+            act = self._sweep("many", nodes, MANY, words=["chunk=10"])
+            self._check_finished(act, *act.fly())
+
+    def _raylet(self) -> None:
+        with running(_ray_nodes("raylet", slow=_SLOW)) as nodes:
+            act = self._sweep("raylet", nodes)
+            end = _fly_through(act, 3, lambda: nodes.kill_node("second"))
+            self._check_finished(act, *end)
+
+    def _driver(self) -> None:
+        with running(_ray_nodes("driver", slow=_SLOW)) as nodes:
+            act = self._sweep("driver", nodes)
+            self._check_finished(act, *_kill_and_repeat(act, 3))
+
+    def _two_drivers(self) -> None:
+        with running(_ray_nodes("two")) as nodes:
+            act = self._sweep("two", nodes)
+            _start_twice(act)
+            act.check(0, self._stage.reference)
+
+    def _blind(self) -> None:
+        folder = self._stage.folder / "ray-blind"
         folder.mkdir()
-        with cluster("blind", blind_to=folder) as nodes:
-            act = sweep("blind", nodes, 2 * _FEW)
+        with running(_ray_nodes("blind", blind_to=folder)) as nodes:
+            act = self._sweep("blind", nodes, 2 * _FEW)
             code, printed = act.fly()
-            act.check(code, stage.reference)
+            act.check(code, self._stage.reference)
             errors = act.errors()
             assert errors, printed
             assert all("127.0.0.2" in error["host"] for error in errors), errors
 
-    return {
-        f"{MANY} runs over two nodes": many,
-        "a raylet killed": raylet,
-        "the driver killed and called again": driver,
-        "two drivers on one sweep": two,
-        "a node without the folder": blind,
-    }
+    def _check_finished(self, act: Sweep, code: int, printed: str) -> None:
+        assert code == 0, printed
+        act.check(code, self._stage.reference)
+
+    def _sweep(
+        self,
+        name: str,
+        nodes: RayNodes,
+        runs: int = _FEW,
+        words: Sequence[str] = ("chunk=1",),
+    ) -> Sweep:
+        address = f"hydra.launcher.ray.init.address={nodes.address}"
+        return Sweep(
+            folder=self._stage.folder / f"ray-{name}",
+            runs=runs,
+            kinds=["Slow"],
+            launcher=["launcher=ray", address, *words],
+            environment=nodes.environment,
+        )
+
+
+def _ray_nodes(name: str, slow: float = 0.0, blind_to: Path | None = None) -> RayNodes:
+    """Returns a cluster on which a step takes ``slow`` seconds."""
+    folder = Path(tempfile.gettempdir()) / f"gpmpc-ray-{name}"
+    return RayNodes(folder, blind_to, {SLOW: str(slow)})
+
+
+def _fly_through(act: Sweep, count: int, disturb: Act) -> tuple[int, str]:
+    """Flies a sweep, and disturbs it while ``count`` of its runs fly."""
+    process = act.start()
+    act.wait_for(count, RunState.RUNNING)
+    disturb()
+    return end_of(process)
+
+
+def _kill_and_repeat(act: Sweep, count: int) -> tuple[int, str]:
+    """Kills a sweep while ``count`` of its runs fly, and flies it again."""
+    process = act.start()
+    act.wait_for(count, RunState.RUNNING)
+    process.kill()
+    process.communicate()
+    return act.fly()
+
+
+def _start_twice(act: Sweep) -> None:
+    """Flies a sweep by two commands at once; both are to end well."""
+    ends = [end_of(process) for process in [act.start(), act.start()]]
+    assert [code for code, _ in ends] == [0, 0], ends
 
 
 def run(acts: Mapping[str, Act], where: str) -> list[tuple[str, str, str, float]]:

@@ -1,14 +1,64 @@
-"""Finds and ends processes, and waits for daemons."""
+"""Starts daemons and waits for them; finds and ends processes."""
 
 import os
 import signal
 import socket
+import subprocess
 import time
-from collections.abc import Callable, Iterable
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 _PATIENCE = 120.0  # until a daemon answers [s]
+
+
+class Cluster(Protocol):
+    """Daemons that work together."""
+
+    def start(self) -> None:
+        """Starts all of them, and waits until they are there."""
+        ...
+
+    def stop(self) -> None:
+        """Ends those that were started."""
+        ...
+
+
+AnyCluster = TypeVar("AnyCluster", bound=Cluster)
+
+
+@contextmanager
+def running(cluster: AnyCluster) -> Iterator[AnyCluster]:
+    """Starts a cluster, and stops it whatever happens."""
+    try:
+        cluster.start()
+        yield cluster
+    finally:
+        cluster.stop()
+
+
+def start_daemon(
+    command: Sequence[str], environment: Mapping[str, str], log: Path
+) -> subprocess.Popen:
+    """Starts a program in a session of its own, which writes into a log."""
+    with log.open("ab") as output:
+        return subprocess.Popen(
+            command,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+            start_new_session=True,
+        )
+
+
+def without_folder(folder: Path | None, command: Sequence[str]) -> list[str]:
+    """Returns a command whose program does not see a folder; None hides none."""
+    if folder is None:
+        return [*command]
+    hidden = f'mount -t tmpfs none "{folder}" && exec "$@"'
+    return ["unshare", "-m", "sh", "-c", hidden, "sh", *command]
 
 
 def descendants(root: int) -> list[int]:
@@ -20,23 +70,23 @@ def descendants(root: int) -> list[int]:
         except OSError:
             continue
         parents[int(path.parent.name)] = int(fields[1])
-    found = [root]
-    for process in found:
-        found += [child for child, parent in parents.items() if parent == process]
-    return found[1:]
+    family = [root]
+    for process in family:
+        family += [child for child, parent in parents.items() if parent == process]
+    return family[1:]
 
 
 def processes_with(variable: str) -> list[int]:
     """Returns the processes with an environment variable, given as NAME=VALUE."""
-    found = []
+    processes = []
     for path in Path("/proc").glob("[0-9]*"):
         try:
             variables = (path / "environ").read_bytes().split(b"\0")
         except OSError:
             continue
         if variable.encode() in variables:
-            found.append(int(path.name))
-    return found
+            processes.append(int(path.name))
+    return processes
 
 
 def kill(processes: Iterable[int]) -> None:

@@ -8,7 +8,14 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
-from benchmarks.cluster.processes import descendants, free_ports, kill, wait_for
+from benchmarks.cluster.processes import (
+    descendants,
+    free_ports,
+    kill,
+    start_daemon,
+    wait_for,
+    without_folder,
+)
 
 _NAMES = ("head", "second")
 _ADDRESSES = {"head": "127.0.0.1", "second": "127.0.0.2"}
@@ -17,12 +24,13 @@ _STORE = 100_000_000  # [bytes] of objects; a sweep has next to none
 
 def missing() -> list[str]:
     """Returns what a cluster needs and this environment lacks."""
-    found = Path(sys.executable).with_name("ray").exists()
-    return [] if found else ["ray (pip install 'gpmpc[ray]')"]
+    if Path(sys.executable).with_name("ray").exists():
+        return []
+    return ["ray (pip install 'gpmpc[ray]')"]
 
 
 class RayNodes:
-    """A cluster of two raylets; a context in which it runs.
+    """A cluster of two raylets.
 
     Args:
         folder: Where it keeps everything; short, since it names sockets.
@@ -51,17 +59,10 @@ class RayNodes:
         """Where a sweep finds it."""
         return f"{_ADDRESSES['head']}:{self._port}"
 
-    def __enter__(self) -> "RayNodes":
-        try:
-            for name in _NAMES:
-                self.start_node(name)
-        except BaseException:
-            self.stop()
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
+    def start(self) -> None:
+        """Starts both nodes."""
+        for name in _NAMES:
+            self.start_node(name)
 
     def start_node(self, name: str) -> None:
         """Starts a raylet, the first one with the head, and waits until it is there."""
@@ -82,20 +83,11 @@ class RayNodes:
             ]
         else:
             command.append(f"--address={self.address}")
-            if self.blind_to is not None:
-                hidden = f'mount -t tmpfs none "{self.blind_to}" && exec "$@"'
-                command = ["unshare", "-m", "sh", "-c", hidden, "sh", *command]
+            command = without_folder(self.blind_to, command)
         self.folder.mkdir(parents=True, exist_ok=True)
         log = self.folder.with_name(f"{self.folder.name}-{name}.out")
-        with log.open("wb") as output:
-            self._daemons[name] = subprocess.Popen(
-                command,
-                env=self.environment,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=output,
-                start_new_session=True,
-            )
+        log.unlink(missing_ok=True)
+        self._daemons[name] = start_daemon(command, self.environment, log)
         wait_for(f"ray, {name}", lambda: "Ray runtime started" in log.read_text())
 
     def kill_node(self, name: str) -> None:

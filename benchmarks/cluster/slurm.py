@@ -20,7 +20,9 @@ from benchmarks.cluster.processes import (
     free_ports,
     kill,
     processes_with,
+    start_daemon,
     wait_for,
+    without_folder,
 )
 
 NODES = ("n1", "n2")
@@ -67,7 +69,8 @@ AccountingStoragePort={database_port}
 AccountingStoragePass={folder}/munge.socket
 """
 _NODE = """
-NodeName={name} NodeHostname={host} NodeAddr=127.0.0.1 Port={port} CPUs=2 RealMemory=8000
+NodeName={name} NodeHostname={host} NodeAddr=127.0.0.1 Port={port} \\
+CPUs=2 RealMemory=8000
 """
 _PARTITION = """
 PartitionName=cpu Nodes={nodes} Default=YES MaxTime=INFINITE State=UP
@@ -97,7 +100,7 @@ def missing(accounting: bool) -> list[str]:
 
 
 class Slurm:
-    """A Slurm of two nodes; a context in which it runs.
+    """A Slurm of two nodes.
 
     Args:
         folder: Where it keeps everything.
@@ -114,29 +117,33 @@ class Slurm:
         }
         self._daemons: dict[str, subprocess.Popen] = {}
 
-    def __enter__(self) -> "Slurm":
+    def start(self) -> None:
+        """Writes its configuration, and starts every daemon."""
         self.folder.mkdir(parents=True)
         self.folder.chmod(0o755)
         self._write_configuration()
-        try:
-            self._start_daemons()
-        except BaseException:
-            self.stop()
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
+        self._start_daemons()
 
     def ask(self, *command: str) -> str:
-        """Returns what a command of Slurm answers."""
+        """Returns what a command of Slurm answers.
+
+        Raises:
+            CalledProcessError: It refuses.
+        """
+        answer = self._run(*command)
+        answer.check_returncode()
+        return answer.stdout
+
+    def _run(self, *command: str) -> subprocess.CompletedProcess[str]:
+        """Runs a command of Slurm to its end, whatever that is."""
         return subprocess.run(
             command,
             env=self.environment,
             capture_output=True,
             text=True,
-            check=True,
-        ).stdout
+            timeout=_PATIENCE,
+            check=False,
+        )
 
     def kill_node(self, name: str) -> None:
         """Kills a node as a power cut would: its daemon, and all that it started."""
@@ -150,10 +157,7 @@ class Slurm:
 
     def start_node(self, name: str, blind_to: Path | None = None) -> None:
         """Starts the daemon of a node, which may not see a folder."""
-        command = ["slurmd", "-D", "-N", name]
-        if blind_to is not None:
-            hidden = f'mount -t tmpfs none "{blind_to}" && exec "$@"'
-            command = ["unshare", "-m", "sh", "-c", hidden, "sh", *command]
+        command = without_folder(blind_to, ["slurmd", "-D", "-N", name])
         self._start(name, command, {_NODE_MARK: name})
 
     def wait_until_idle(self) -> None:
@@ -163,13 +167,7 @@ class Slurm:
     def stop(self) -> None:
         """Ends the jobs and every daemon."""
         if "slurmctld" in self._daemons:
-            subprocess.run(
-                ["scancel", "--full", f"--user={getpass.getuser()}"],
-                env=self.environment,
-                capture_output=True,
-                timeout=_PATIENCE,
-                check=False,
-            )
+            self._run("scancel", "--full", f"--user={getpass.getuser()}")
         for name in NODES:
             if name in self._daemons:
                 self.kill_node(name)
@@ -260,33 +258,15 @@ class Slurm:
         wait_for("slurmdbd", self._has_accounts)
 
     def _has_accounts(self) -> bool:
-        listed = subprocess.run(
-            ["sacctmgr", "--noheader", "list", "cluster"],
-            env=self.environment,
-            capture_output=True,
-            check=False,
-        )
-        return listed.returncode == 0
+        return self._run("sacctmgr", "--noheader", "list", "cluster").returncode == 0
 
     def _is_ready(self) -> bool:
-        states = subprocess.run(
-            ["sinfo", "--noheader", "--Node", "--format=%T"],
-            env=self.environment,
-            capture_output=True,
-            text=True,
-            check=False,
-        ).stdout.split()
-        return states.count("idle") == len(NODES)
+        listed = self._run("sinfo", "--noheader", "--Node", "--format=%T").stdout
+        return listed.split().count("idle") == len(NODES)
 
     def _start(
         self, name: str, command: Sequence[str], marks: Mapping[str, str] | None = None
     ) -> None:
-        with (self.folder / f"{name}.out").open("ab") as output:
-            self._daemons[name] = subprocess.Popen(
-                command,
-                env=self.environment | dict(marks or {}),
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=output,
-                start_new_session=True,
-            )
+        environment = self.environment | dict(marks or {})
+        log = self.folder / f"{name}.out"
+        self._daemons[name] = start_daemon(command, environment, log)
