@@ -4,11 +4,11 @@
 
 Two synthetic records, each learned from one run and judged on another by free
 simulation, from the first rows on with nothing but the inputs: two tanks one above the
-other, of which the lower level alone is measured (outflows by the square root, the upper
-one overflows into the lower one), and a converter that is linear, then clipped, then
-linear again. Beside it the best linear ARX model of 1 to 15 rows, fitted one step ahead
-to the same rows, with the order that is best **on the run that it is judged on**. RMSE
-in units of the output. Writes ``outputs/benchmarks/outputs_only.json``.
+other, of which the lower level alone is measured (outflows by the square root, the
+upper one overflows into the lower one), and a converter that is linear, then clipped,
+then linear again. Beside it the best linear ARX model of 1 to 15 rows, fitted one step
+ahead to the same rows, with the order that is best **on the run that it is judged on**.
+RMSE in units of the output. Writes ``outputs/benchmarks/outputs_only.json``.
 """
 
 import argparse

@@ -52,7 +52,10 @@ DYNAMICS_RULE = (
     "where, ...), for floats, arrays and CasADi"
 )
 _UNDECIDED = ("truth value", "Boolean value")  # of what has no single one
-_DECISION = "gpmpc.systems.where, min or max for if, and, or, min, max of what has no number yet"
+_DECISION = (
+    "gpmpc.systems.where, min or max for if, and, or, min, max of what has no number "
+    "yet"
+)
 
 
 def call(key: str, function: Callable[..., Any], *arguments: Tensor) -> Any:

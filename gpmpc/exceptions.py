@@ -119,16 +119,13 @@ def check_number(
     ):
         return
     kind = "a whole number" if whole else "a number"
-    limit = (
-        f" above {above}"
-        if above is not None
-        else f", {least} or more"
-        if least is not None
-        else ""
-    )
-    raise SettingError(
-        key, f"must be {kind}{limit}{' ' + unit if unit else ''}; got {value!r}"
-    )
+    limit = ""
+    if above is not None:
+        limit = f" above {above}"
+    elif least is not None:
+        limit = f", {least} or more"
+    in_unit = f" {unit}" if unit else ""
+    raise SettingError(key, f"must be {kind}{limit}{in_unit}; got {value!r}")
 
 
 def _plain(value: Any) -> Any:

@@ -110,7 +110,9 @@ def fly(name: str, seed: int) -> dict[str, Any]:
     started = time.perf_counter()
     script = _run_script(name, seed)
     seconds = time.perf_counter() - started
-    plant, controller, flight = script["plant"], script["controller"], script["flight"]
+    plant = script["plant"]
+    controller = script["controller"]
+    flight = script["flight"]
     cost = controller.problem.cost
     reference = script.get("reference", plant.goal)
     twins = [
@@ -159,10 +161,10 @@ def _run_script(name: str, seed: int) -> dict[str, Any]:
 
 
 def _is_up(plant: System, flight: Any) -> bool:
-    """Whether all angles are near upright through the last second."""
+    """Whether the pendulum, the last angle, is near upright through the last second."""
     steps = round(1.0 / plant.time_step)
-    angles = plant.angle_indices[-1:]
-    return bool((np.abs(wrap(flight.states[-steps:, angles])) < NEAR).all())
+    angles = wrap(flight.states[-steps:, plant.angle_indices[-1]])
+    return bool((np.abs(angles) < NEAR).all())
 
 
 def flown_before() -> dict[tuple[str, int], dict[str, Any]]:
@@ -197,9 +199,7 @@ def print_table(
     robots: list[str], seeds: int, flights: dict[tuple[str, int], dict[str, Any]]
 ) -> None:
     """Prints a row a robot, in Markdown."""
-    print(
-        "| robot | rows | cost over that of the true model, worst | up | decision [ms] |"
-    )
+    print("| robot | rows | cost over the true model's, worst | up | decision [ms] |")
     print("| --- | --- | --- | --- | --- |")
     for name in robots:
         own = [flights[name, seed] for seed in range(seeds)]

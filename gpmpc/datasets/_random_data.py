@@ -37,7 +37,8 @@ class RandomData:
     Transitions(20 rows, n=2, m=1)
 
     See Also:
-        ``gpmpc.gp.Transitions`` for data of your own, ``gpmpc.logs.read_log`` for a log.
+        ``gpmpc.gp.Transitions`` for data of your own, ``gpmpc.logs.read_log`` for a
+        log.
     """
 
     samples: int = 200  #: how many

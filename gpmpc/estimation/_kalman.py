@@ -241,8 +241,8 @@ class KalmanFilter:
             adds no process noise.
 
     See Also:
-        ``Measurement``; ``LateMeasurements`` for those that come late; ``smooth`` for what
-        was filtered.
+        ``Measurement``; ``LateMeasurements`` for those that come late; ``smooth`` for
+        what was filtered.
     """
 
     def __init__(

@@ -70,8 +70,8 @@ class GPPosterior(TensorModel):
         k(x, x') = sf^2 exp(-1/2 sum_i (x_i - x'_i)^2 / l_i^2)
 
     See Also:
-        ``Trainer``, which makes it of data; ``save_posterior``; ``append_transitions`` for
-        further data.
+        ``Trainer``, which makes it of data; ``save_posterior``; ``append_transitions``
+        for further data.
     """
 
     features: Tensor  #: x~ = (x, u) of the training points (N, n + m)

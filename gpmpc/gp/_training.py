@@ -102,8 +102,8 @@ class Trainer:
     GPPosterior(8 points, n=1, m=1, k=1, predicts='difference', torch.float64 on cpu)
 
     See Also:
-        ``gpmpc.models.train``, which knows a system's angles and rates; ``SparseTrainer``
-        for thousands of points; ``Transitions``.
+        ``gpmpc.models.train``, which knows a system's angles and rates;
+        ``SparseTrainer`` for thousands of points; ``Transitions``.
     """
 
     #: what the GPs learn: the next state, the difference to it, or any values, which

@@ -156,7 +156,8 @@ class LeastSquares:
         SettingError: y is no function, the weight is not symmetric positive
             semidefinite, or a length is wrong.
 
-    >>> LeastSquares(lambda x: x[:, :1] ** 2, weight=[1.0], reference=[4.0]).weight.tolist()
+    >>> energy = LeastSquares(lambda x: x[:, :1] ** 2, weight=[1.0], reference=[4.0])
+    >>> energy.weight.tolist()
     [[1.0]]
 
     See Also:

@@ -189,8 +189,8 @@ class ControlLoop:
         SettingError: No such policy.
 
     See Also:
-        ``gpmpc.simulation.closed_loop``, which does the same with a plant of this package;
-        the guide "Your own loop".
+        ``gpmpc.simulation.closed_loop``, which does the same with a plant of this
+        package; the guide "Your own loop".
     """
 
     def __init__(self, controller: Controller, on_failure: OnFailure = "previous_plan"):

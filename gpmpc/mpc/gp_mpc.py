@@ -150,14 +150,16 @@ class GPMPC:
     >>> B = torch.tensor([[0.0], [0.1]], dtype=torch.float64)
     >>> model = KnownModel(lambda x, u: x @ A.T + u @ B.T, state_dim=2, input_dim=1)
     >>> problem = Problem(Tracking([1.0, 0.1], [0.1]), inputs=Box([-1.0], [1.0]))
-    >>> controller = GPMPC(model, Linearization(), problem, horizon=10, initial_input=[0.0])
+    >>> controller = GPMPC(
+    ...     model, Linearization(), problem, horizon=10, initial_input=[0.0]
+    ... )
     >>> controller.horizon, controller.iterations
     (10, None)
 
     See Also:
         ``ControlLoop`` for a loop of your own, ``gpmpc.simulation.closed_loop`` for a
-        simulated one; ``ManyStarts`` where a plan may end in the wrong valley; ``NMPC`` of
-        ``gpmpc.mpc.baselines`` on the true model.
+        simulated one; ``ManyStarts`` where a plan may end in the wrong valley; ``NMPC``
+        of ``gpmpc.mpc.baselines`` on the true model.
     """
 
     def __init__(

@@ -128,15 +128,15 @@ class Box(Constraint):
     Raises:
         SettingError: Crossed bounds, or as for ``Constraint``.
 
-    Of a state with a probability p it is E[x] + kappa std(x) <= upper, kappa the quantile
-    of the normal distribution at p, and likewise below.
+    Of a state with a probability p it is E[x] + kappa std(x) <= upper, kappa the
+    quantile of the normal distribution at p, and likewise below.
 
     >>> Box([-1.0, -math.inf], [1.0, math.inf], probability=0.95).size
     2
 
     See Also:
-        ``Halfspaces`` and ``Inequality``; ``Problem``, whose inputs, rates and constraints
-        they are.
+        ``Halfspaces`` and ``Inequality``; ``Problem``, whose inputs, rates and
+        constraints they are.
     """
 
     #: list or array (d,), or (H, d) by stage, kept as an array; -inf where there is
@@ -277,8 +277,8 @@ class Inequality(Constraint):
     1
 
     See Also:
-        ``Box`` and ``Halfspaces``, which are linear; ``ControlLoop.input``, which takes the
-        parameters p.
+        ``Box`` and ``Halfspaces``, which are linear; ``ControlLoop.input``, which takes
+        the parameters p.
     """
 
     #: a function of tensors or in CasADi, like y of ``LeastSquares``, that gives

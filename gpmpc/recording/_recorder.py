@@ -60,8 +60,8 @@ class McapRecorder:
         RecordingError: The file cannot be written, or another process is writing it.
 
     See Also:
-        ``RecordedSystem.of``, which describes a system; ``read_run``, which reads the file;
-        ``closed_loop``, whose ``on_step`` takes ``record``.
+        ``RecordedSystem.of``, which describes a system; ``read_run``, which reads the
+        file; ``closed_loop``, whose ``on_step`` takes ``record``.
     """
 
     def __init__(

@@ -83,8 +83,8 @@ def closed_loop(
         Diverged: The system left the finite numbers; ``flown`` holds the steps before.
 
     See Also:
-        ``closed_loops`` for many seeds; ``gpmpc.plotting.flight_figure``, which draws what
-        it returns; ``gpmpc.mpc.ControlLoop`` for a plant of your own.
+        ``closed_loops`` for many seeds; ``gpmpc.plotting.flight_figure``, which draws
+        what it returns; ``gpmpc.mpc.ControlLoop`` for a plant of your own.
     """
     if not (on_step is None or callable(on_step)):
         raise SettingError(

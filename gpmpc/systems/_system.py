@@ -57,8 +57,9 @@ class System:
     ('Cart', ('position', 'speed'), 'm')
 
     See Also:
-        ``step`` and ``step_many``, which move it on; ``gpmpc.systems.pendulum`` and others
-        that come with the package; ``gpmpc.simulation.closed_loop``, which flies it.
+        ``step`` and ``step_many``, which move it on; ``gpmpc.systems.pendulum`` and
+        others that come with the package; ``gpmpc.simulation.closed_loop``, which flies
+        it.
     """
 
     #: names of states and inputs, and how it moves
@@ -430,7 +431,8 @@ def step_many(plant: System, states: Array, inputs: Array) -> Array:
         DataError: They are no real numbers.
 
     >>> from gpmpc.systems import double_integrator
-    >>> step_many(double_integrator(), [[0.0, 1.0], [0.0, 2.0]], [[0.0], [0.0]]).tolist()
+    >>> states = [[0.0, 1.0], [0.0, 2.0]]
+    >>> step_many(double_integrator(), states, inputs=[[0.0], [0.0]]).tolist()
     [[0.1, 1.0], [0.2, 2.0]]
     """
     check_system("plant", plant)

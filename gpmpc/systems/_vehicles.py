@@ -20,8 +20,8 @@ _SLOWEST = 0.5  # [m/s] below which the slip of a tyre is that of this speed
 class KinematicBicycle:
     """A car whose wheels roll without slip.
 
-    Source: Kong, Pfeiffer, Schildbach and Borrelli (2015), Kinematic and dynamic vehicle
-    models for autonomous driving control design.
+    Source: Kong, Pfeiffer, Schildbach and Borrelli (2015), Kinematic and dynamic
+    vehicle models for autonomous driving control design.
     """
 
     curvature: float = 1.0  #: of the path, per tangent of the steering: 1 / wheelbase
