@@ -252,7 +252,7 @@ class _WidthPanel:
             ylim=(0, 1.15 * scale * largest or 1.0),
         )
         axis.xaxis.set_major_locator(MaxNLocator(integer=True))
-        axis.legend(loc="upper left", ncols=2, fontsize="small")
+        axis.legend(loc="lower right", ncols=2, fontsize="small")
 
     def draw(self, k: int) -> None:
         """Draws the plan of step k."""
