@@ -49,7 +49,8 @@ def make(folder: Path, count: int) -> None:
     tree = folder / "sweep"
     plan = []
     for i in range(count):
-        mass, seed = 1 + i // SEEDS / 1000, i % SEEDS
+        mass = 1 + i // SEEDS / 1000
+        seed = i % SEEDS
         choices = sorted([*FLIGHT, f"seed={seed}", f"system.mass={mass}"])
         plan.append(choices)
         result["choices"] = choices

@@ -98,8 +98,8 @@ class Ray:
         except self._ray.exceptions.RayError as error:
             kind = type(error).__name__
             cause = _CAUSES.get(kind, Cause.ERROR)
-            told = f"Ray could not fly it: {' '.join(str(error).split())[:300]}"
-            reason = f"{_REASONS.get(cause, told)} ({kind})"
+            message = f"Ray could not fly it: {' '.join(str(error).split())[:300]}"
+            reason = f"{_REASONS.get(cause, message)} ({kind})"
             return ChunkEnd(chunk, "", cause, reason)
         return ChunkEnd(chunk, host, remarks=remarks)
 

@@ -184,7 +184,7 @@ class Slurm:
         parts = [chunks[i : i + most] for i in range(0, len(chunks), most)]
         at_once = max(1, self._at_once // max(1, len(parts)))
         submitted = [self._submit(work, part, at_once) for part in parts]
-        return self._ends([*self._adopted, *submitted])
+        return self._watch([*self._adopted, *submitted])
 
     def close(self) -> None:
         pass
@@ -222,17 +222,11 @@ class Slurm:
         words = [
             f"--{key}={value}" for key, value in options.items() if value is not None
         ]
-        asked = subprocess.run(
-            ["sbatch", "--parsable", *words],
-            input=self._script(folder),
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        if asked.returncode:
+        answer = _run(["sbatch", "--parsable", *words], script=self._script(folder))
+        if answer.returncode:
             shutil.rmtree(folder)
-            raise GpmpcError(f"Slurm refuses the sweep: {_one_line(asked.stderr)}")
-        write_whole(folder / _SUBMITTED, asked.stdout)
+            raise GpmpcError(f"Slurm refuses the sweep: {_one_line(answer.stderr)}")
+        write_whole(folder / _SUBMITTED, answer.stdout)
         return _Array(name, folder, chunks, {*range(len(chunks))})
 
     def _script(self, folder: Path) -> str:
@@ -246,22 +240,22 @@ class Slurm:
         ]
         return "\n".join(lines) + "\n"
 
-    def _ends(self, arrays: Sequence[_Array]) -> Iterator[ChunkEnd]:
-        """Looks at the queue until it holds none of the arrays."""
+    def _watch(self, arrays: Sequence[_Array]) -> Iterator[ChunkEnd]:
+        """Looks at the queue until all jobs of the arrays have ended; yields ends."""
         interval = _FIRST_LOOK
         last_answer = time.monotonic()
-        said = False
+        silence_reported = False
         try:
             while any(array.waiting for array in arrays):
                 jobs = _queue()
                 if jobs is not None:
                     last_answer = time.monotonic()
-                    said = False
+                    silence_reported = False
                     ends = [*self._look(arrays, jobs)]
                     yield from ends
                     interval = _FIRST_LOOK if ends else interval
-                elif not said and time.monotonic() - last_answer > _SILENCE:
-                    said = True
+                elif not silence_reported and time.monotonic() - last_answer > _SILENCE:
+                    silence_reported = True
                     print_error("squeue has not answered for a minute; waiting for it")
                 if any(array.waiting for array in arrays):
                     time.sleep(interval)
@@ -279,16 +273,16 @@ class Slurm:
         for array in arrays:
             if not array.waiting:
                 continue
-            ended = self._ended(array, jobs)
+            ended = self._newly_ended(array, jobs)
             array.waiting -= ended.keys()
             for index, job in ended.items():
-                yield self._end(array, index, job)
+                yield self._chunk_end(array, index, job)
             states = [jobs.get((array.name, i)) for i in range(len(array.chunks))]
             some_wait = any(job and job.state not in _ENDED_STATES for job in states)
             if not array.waiting and not some_wait:
                 write_whole(array.folder / _ENDED, "")
 
-    def _ended(
+    def _newly_ended(
         self, array: _Array, jobs: Mapping[tuple[str, int], _Job]
     ) -> dict[int, _Job | None]:
         """Returns the jobs of an array that have ended since the last look.
@@ -313,7 +307,7 @@ class Slurm:
                 ended[index] = job or accounted.get(index)
         return ended
 
-    def _end(self, array: _Array, index: int, job: _Job | None) -> ChunkEnd:
+    def _chunk_end(self, array: _Array, index: int, job: _Job | None) -> ChunkEnd:
         """Returns how a job ended."""
         log = _tail(array.folder / f"{index}.log")
         cause = _cause(job, log)
@@ -350,8 +344,8 @@ class Slurm:
         if own:
             return f"failed: {own[-1]}"
         how = f" ({job.reason})" if job and job.reason else ""
-        told = f"; its log ends: {_one_line(log)[-200:]!r}" if log.strip() else ""
-        return f"died, and nobody says why{how}{told}"
+        last_words = f"; its log ends: {_one_line(log)[-200:]!r}" if log.strip() else ""
+        return f"died, and nobody says why{how}{last_words}"
 
 
 def _cause(job: _Job | None, log: str | None) -> Cause | None:
@@ -391,9 +385,7 @@ def _done_on(log: str) -> str:
 def _queue() -> dict[tuple[str, int], _Job] | None:
     """Returns this user's jobs by array's name and index; None if Slurm is silent."""
     command = ["squeue", "--me", "--array", "--noheader", "--states=all"]
-    listed = subprocess.run(
-        [*command, f"--format={_FORMAT}"], capture_output=True, text=True, check=False
-    )
+    listed = _run([*command, f"--format={_FORMAT}"])
     if listed.returncode:
         return None
     jobs = {}
@@ -409,12 +401,7 @@ def _accounted(name: str) -> dict[int, _Job]:
     if shutil.which("sacct") is None:
         return {}
     command = ["sacct", "--noheader", "--allocations", "--parsable2", f"--name={name}"]
-    listed = subprocess.run(
-        [*command, "--format=JobID,State,NodeList"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    listed = _run([*command, "--format=JobID,State,NodeList"])
     if listed.returncode:
         return {}
     jobs = {}
@@ -430,16 +417,23 @@ def _accounted(name: str) -> dict[int, _Job]:
 
 def _cancel(job: _Job) -> None:
     """Takes a job that Slurm gave up out of its queue."""
-    subprocess.run(["scancel", job.number], capture_output=True, check=False)
+    _run(["scancel", job.number])
 
 
 def _most_tasks() -> int:
     """Returns how many jobs an array may have."""
-    asked = subprocess.run(
-        ["scontrol", "show", "config"], capture_output=True, text=True, check=False
-    )
-    match = re.search(r"^MaxArraySize\s*=\s*(\d+)", asked.stdout, re.MULTILINE)
+    settings = _run(["scontrol", "show", "config"]).stdout
+    match = re.search(r"^MaxArraySize\s*=\s*(\d+)", settings, re.MULTILINE)
     return max(1, int(match[1]) - 1) if match else _MOST_TASKS
+
+
+def _run(
+    command: Sequence[str], script: str | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Runs a command of Slurm, which may fail, with a script on its standard input."""
+    return subprocess.run(
+        command, input=script, capture_output=True, text=True, check=False
+    )
 
 
 def _tail(log: Path) -> str | None:
