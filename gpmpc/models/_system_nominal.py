@@ -116,14 +116,14 @@ class SystemNominal:
         """Computes the rates of change (..., n) at states (..., n)."""
         parameters = [np.asarray(value, dtype=float) for value in theta]
         if all(value.ndim == 0 for value in parameters):
-            return self._rates_of_rows(self._made(parameters), states, inputs)
+            return self._rates_of_rows(self._system_of(parameters), states, inputs)
         if self._takes_arrays:
             return self._rates(self._with_arrays(parameters), states, inputs)
         return self._outputs_one_by_one(parameters, states, inputs)
 
     @cached_property
     def _system(self) -> System:
-        return self._made(self.start.tolist())
+        return self._system_of(self.start.tolist())
 
     @cached_property
     def _state_order(self) -> list[int]:
@@ -134,21 +134,21 @@ class SystemNominal:
     def _input_order(self) -> list[int]:
         return _order(self._system.input_names, self.input_names)
 
-    def _made(self, values: Sequence[Any]) -> System:
+    def _system_of(self, values: Sequence[Any]) -> System:
         """Makes the system of parameters, by its factory; the last ones are kept."""
         key = tuple(map(float, values))
-        if key not in self._made_systems:
+        if key not in self._systems:
             parameters = dict(zip(self.parameter_names, key, strict=True))
             arguments = {**self.fixed, **parameters}
-            if len(self._made_systems) >= _KEPT:
-                self._made_systems.clear()
-            self._made_systems[key] = make_system(
+            if len(self._systems) >= _KEPT:
+                self._systems.clear()
+            self._systems[key] = make_system(
                 self.factory, self.code, arguments, self.time_step
             )
-        return self._made_systems[key]
+        return self._systems[key]
 
     @cached_property
-    def _made_systems(self) -> dict[tuple[float, ...], System]:
+    def _systems(self) -> dict[tuple[float, ...], System]:
         return {}
 
     def _with_arrays(self, values: Sequence[Array]) -> System:
@@ -162,7 +162,7 @@ class SystemNominal:
 
     @cached_property
     def _takes_arrays(self) -> bool:
-        """Whether the dynamics only use their parameters, and nothing made of them.
+        """Whether the dynamics only use their parameters, and nothing derived of them.
 
         Otherwise, each vector of parameters makes a system of its own.
         """
@@ -197,7 +197,7 @@ class SystemNominal:
         for row in range(batch[0]):
             values = [float(value[row].flat[0]) for value in parameters]
             try:
-                system = self._made(values)
+                system = self._system_of(values)
             except GpmpcError:
                 continue
             outputs[row] = self._rates_of_rows(system, states[row], inputs[row])
@@ -241,24 +241,24 @@ def make_system(
     if _TIME_STEP in signature(factory).parameters:
         arguments = {**arguments, _TIME_STEP: time_step}
     try:
-        made = factory(**arguments)
+        product = factory(**arguments)
     except GpmpcError:
         raise
     except Exception as error:  # whatever a user's code raises
         reason = f"{type(error).__name__}: {' '.join(str(error).split())}"
         raise SettingError("nominal", f"{code} cannot be made ({reason})") from error
-    if not isinstance(made, System):
+    if not isinstance(product, System):
         substeps = min(max(round(time_step / _SHORT_STEP), 1), _MOST_SUBSTEPS)
-        return System(made, time_step, substeps)
-    if made.stateful:
+        return System(product, time_step, substeps)
+    if product.stateful:
         raise SettingError("nominal", f"{code} is a simulator that moves on by itself")
-    if not np.isclose(made.time_step, time_step, rtol=1e-6):
+    if not np.isclose(product.time_step, time_step, rtol=1e-6):
         raise SettingError(
             "nominal",
-            f"{code} has a time step of {made.time_step:g} s, and the log one of "
+            f"{code} has a time step of {product.time_step:g} s, and the log one of "
             f"{time_step:g} s; give it an argument {_TIME_STEP}",
         )
-    return made
+    return product
 
 
 def numeric_arguments(factory: Callable[..., Any], code: str) -> dict[str, float]:
@@ -275,8 +275,8 @@ def numeric_arguments(factory: Callable[..., Any], code: str) -> dict[str, float
     }
     kinds = {parameter.kind for parameter in parameters.values()}
     if Parameter.VAR_KEYWORD in kinds:
-        made = factory()
-        dynamics = made.dynamics if isinstance(made, System) else made
+        product = factory()
+        dynamics = product.dynamics if isinstance(product, System) else product
         attributes = getattr(dynamics, "__dict__", {})
         numbers = {k: float(v) for k, v in attributes.items() if _is_number(v)}
         defaults |= numbers
