@@ -510,9 +510,9 @@ def _check_past(model: LogModel, input_dim: int, regressor_count: int) -> None:
             raise DataError("time_constants must not be negative")
     if model.weights.size or not model.memory.empty:
         check_shape("weights", model.weights, (outputs, regressor_count))
-    known = range(outputs)
-    if not all(type(i) is int and i in known for i in model.without_nominal):
-        raise DataError(f"without_nominal must name outputs; got {known!r:.80}")
+    without = model.without_nominal
+    if not all(type(i) is int and 0 <= i < outputs for i in without):
+        raise DataError(f"without_nominal must name outputs; got {without!r:.80}")
     if regressor_count > _MOST:
         raise DataError(f"the model remembers more than {_MOST} numbers")
 
