@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from gpmpc._dynamics import Array
-from gpmpc.exceptions import DataError, ShapeError, check_number
+from gpmpc.exceptions import DataError, ShapeError, check_kind, check_number
 from gpmpc.logs._log import Log
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._log_model import LogModel
@@ -63,10 +63,13 @@ def fit_nominal(
             logarithm, count.
 
     Raises:
+        SettingError: An argument is of another kind or out of range.
         ShapeError: theta0 has another length.
         DataError: No piece of the log is long enough, or the rollouts at theta0 are not
             finite.
     """
+    check_kind("model", model, LogModel, "a LogModel")
+    check_kind("log", log, Log, "a Log of read_log")
     check_number("steps", steps, least=1, whole=True)
     theta0 = np.asarray(model.nominal.start if theta0 is None else theta0, dtype=float)
     count = len(model.nominal.parameter_names)

@@ -10,9 +10,10 @@ a single table, and ``_ulog`` for one with topics.
 """
 
 from collections.abc import Iterable
+from os import PathLike
 from pathlib import Path
 
-from gpmpc.exceptions import DataError, GpmpcError
+from gpmpc.exceptions import DataError, GpmpcError, check_kind
 from gpmpc.logs._columns import with_unique_names
 from gpmpc.logs._csv import read_csv
 from gpmpc.logs._file import (
@@ -82,8 +83,10 @@ def read_file(
             ``gpmpc.logs._bag``.
 
     Raises:
+        SettingError: ``path`` is no path.
         DataError: The file cannot be read, or holds no rows.
     """
+    check_kind("path", path, (str, PathLike), "the name of a file")
     path = Path(path)
     if not path.exists():
         raise DataError(f"{path}: no such file")

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from gpmpc._dynamics import Array
-from gpmpc.exceptions import DataError, SettingError, check_number
+from gpmpc.exceptions import DataError, SettingError, check_kind, check_number
 from gpmpc.logs._channel_figures import (
     ChannelFigures,
     channel_table,
@@ -150,8 +150,10 @@ def inspect_log(
 
     Raises:
         DataError: The file cannot be read, or a column that is named is missing.
-        SettingError: Times are said twice.
+        SettingError: ``mapping`` is of another kind, or times are said twice.
     """
+    if mapping is not None:
+        check_kind("mapping", mapping, LogMapping, "a LogMapping")
     _check_times(mapping, time, time_step)
     topics = {signal.topic for signal in mapping.signals} if mapping else ()
     stamp = mapping.stamp if mapping else ""

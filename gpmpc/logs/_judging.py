@@ -16,6 +16,7 @@ import pandas as pd
 from scipy.special import ndtri
 
 from gpmpc._dynamics import Array
+from gpmpc.exceptions import SettingError, check_kind, check_number
 from gpmpc.logs._baselines import baseline_errors
 from gpmpc.logs._comparison import Comparison, compare
 from gpmpc.logs._fitting import PAST
@@ -119,8 +120,13 @@ def judge(
         steps: k.
 
     Raises:
+        SettingError: An argument is of another kind, or there is no step.
         DataError: No piece of the held-out log is long enough.
     """
+    check_kind("learned", learned, IdentifiedModel, "what learn returns")
+    check_kind("held_out", held_out, Log, "a Log of read_log")
+    check_kind("train", train, Log, "a Log of read_log")
+    _check_steps(steps)
     model = learned.model
     space = held_out.space
     windows = held_out.windows(max(steps), max(model.past, PAST), most=_WINDOWS)
@@ -146,6 +152,14 @@ def judge(
         windows=len(windows),
         comparisons=_comparisons(distances, windows),
     )
+
+
+def _check_steps(steps: Sequence[int]) -> None:
+    """Raises ``SettingError`` unless steps are numbers of one or more."""
+    if np.ndim(steps) != 1 or not np.size(steps):
+        raise SettingError("steps", f"must be a list of numbers; got {steps!r}")
+    for step in steps:
+        check_number("steps", step, least=1, whole=True)
 
 
 def _comparisons(

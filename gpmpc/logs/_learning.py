@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gpmpc._dynamics import Array
-from gpmpc.exceptions import check_number
+from gpmpc.exceptions import check_kind, check_number
 from gpmpc.gp._wrapped import warn_of_turns
 from gpmpc.logs._comparison import Comparison
 from gpmpc.logs._control_fitness import ControlFitness, judge_for_control
@@ -77,11 +77,14 @@ def learn(
             correction by the past. Judges what the inputs do.
 
     Raises:
+        SettingError: ``log`` is no log, or a setting is out of range.
         DataError: The log is too short for rollouts of that many steps.
         TrainingError: A GP could not be trained.
     """
+    check_kind("log", log, Log, "a Log of read_log")
     check_number("points", points, least=10, whole=True)
     check_number("steps", steps, least=2, whole=True)
+    check_number("seed", seed, least=0, whole=True)
     advice = "Say kind: angle of it in the mapping"
     warn_of_turns(log.transitions(), log.space.angles, advice)
     folds = split_folds(log, PAST_ROWS, steps)
@@ -97,6 +100,17 @@ def learn(
         for_control=for_control,
     )
     search.run()
+    return _identify(search, log, folds.sentence, progress, for_control)
+
+
+def _identify(
+    search: Search,
+    log: Log,
+    folds: str,
+    progress: Callable[[str], None],
+    for_control: bool,
+) -> IdentifiedModel:
+    """Fits the best structure of a search to all runs, and its noise; see ``learn``."""
     progress(f"chosen: {search.best.name}")
     comparisons = search.comparisons()
     progress("noise from the errors of held-out rollouts")
@@ -119,7 +133,7 @@ def learn(
         context_names=log.mapping.column_names("context"),
         time_step=log.time_step,
         judged_steps=search.judged_steps,
-        folds=folds.sentence,
+        folds=folds,
         comparisons=comparisons,
         control=control,
     )

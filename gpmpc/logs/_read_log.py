@@ -1,13 +1,14 @@
 """Reads log files as a ``Log``: files to tables, to runs, to usable rows."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gpmpc._bounds import MemoryBudget
-from gpmpc.exceptions import DataError
+from gpmpc.exceptions import DataError, check_kind
 from gpmpc.logs._columns import check_column, named_columns, runs_side_by_side
 from gpmpc.logs._conventions import read_rigid_bodies
 from gpmpc.logs._file import Tables, run_name
@@ -65,9 +66,14 @@ def read_log(
 
 
 def _as_paths(files: str | Path | Sequence[str | Path]) -> list[Path]:
-    if isinstance(files, str | Path):
+    if isinstance(files, str | PathLike):
         return [Path(files)]
-    return [Path(file) for file in files]
+    check_kind("files", files, Iterable, "the name of a file, or several")
+    paths = []
+    for file in files:
+        check_kind("files", file, (str, PathLike), "names of files")
+        paths.append(Path(file))
+    return paths
 
 
 def _as_mapping(mapping: LogMapping | Mapping[str, Any] | str | Path) -> LogMapping:

@@ -16,7 +16,7 @@ from torch import Tensor
 from gpmpc._dynamics import DynamicsModel
 from gpmpc._files import existing_file, new_file
 from gpmpc._trust import trusted_packages
-from gpmpc.exceptions import DataError, SettingError
+from gpmpc.exceptions import DataError, SettingError, check_kind
 from gpmpc.gp import load_metadata
 from gpmpc.gp._storage import consistent, read_model, write_model
 from gpmpc.logs._comparison import Comparison
@@ -42,10 +42,11 @@ def save_learned(learned: IdentifiedModel, path: str | Path) -> None:
     """Writes what was learned from a log, in one piece or not at all.
 
     Raises:
-        SettingError: The nominal model is a user's own, which a file of numbers cannot
-            hold.
+        SettingError: ``learned`` is of another kind, or its nominal model is a user's
+            own, which a file of numbers cannot hold.
         DataError: The folder does not exist.
     """
+    check_kind("learned", learned, IdentifiedModel, "what learn returns")
     path = new_file(path)
     named = NamedLogModel(
         model=learned.model,

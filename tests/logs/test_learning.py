@@ -14,6 +14,7 @@ from gpmpc.logs import (
     Log,
     LogMapping,
     fit_nominal,
+    inspect_log,
     judge,
     learn,
     load_learned,
@@ -358,6 +359,25 @@ def test_misuse_is_named(flights):
         fit_nominal(model, None, log, steps=3000)
     with pytest.raises(SettingError, match="past"):
         replace(model, theta=model.nominal.start).rollout(log.windows(10))
+
+
+OF_OTHER_KINDS = {
+    "log: must be a Log": lambda log: learn("flight.csv"),
+    "seed: must be a whole number": lambda log: learn(log, seed="a"),
+    "learned: must be what learn returns": lambda log: judge(log, log, log),
+    "model: must be a LogModel": lambda log: fit_nominal(log, None, log),
+    "learned: must be what": lambda log: save_learned(log, "model.safetensors"),
+    "mapping: must be a LogMapping": lambda log: inspect_log("a.csv", {"time": "t"}),
+    "path: must be the name of a file": lambda log: inspect_log(log),
+    "files: must be the name of a file": lambda log: read_log(5, MAPPING),
+    "files: must be names of files": lambda log: read_log([log], MAPPING),
+}
+
+
+@pytest.mark.parametrize("text", OF_OTHER_KINDS)
+def test_arguments_of_another_kind_are_named(flights, text):
+    with pytest.raises(SettingError, match=f"^{text}"):
+        OF_OTHER_KINDS[text](as_log(flights[:1]))
 
 
 FLIGHTS = os.environ.get("GPMPC_FLIGHTS")
