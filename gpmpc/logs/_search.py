@@ -52,7 +52,7 @@ _CLOSE = 0.02  # of the best score: where the second one goes on as well
 _FEW = 10_000  # rows of a log, up to which half of them make a worse model
 _WINDOWS = 200  # of a fold, that structures are compared on
 _CORRECTED_WINDOWS = 1200  # of a fold, that a correction is fitted to
-_CHUNKS = 6  # of held-out rollouts, each corrected by what the others say
+_PARTS = 6  # of the held-out runs, each corrected by what the others say
 _LARGEST = 1e6  # state of a rollout that a correction is fitted to
 _CORRECTED = 2  # structures upon which a correction is tried
 _FILTERED_WINDOWS = 4000  # that the filter of starts is fitted to
@@ -334,10 +334,11 @@ class Search:
         # Of those without a memory, GPs see rows without noise.
         plain = [one for one in ranked if one.model.memory.empty]
         starts = [*ranked[:1], *[one for one in plain[:1] if one is not ranked[0]]]
+        keys = [start.key for start in starts]
         for base in self._bases:
             nominal = base.model.nominal
             is_still = isinstance(nominal, AffineNominal) and not nominal.fitted
-            if is_still and base.base == "constant state" and base not in starts:
+            if is_still and base.base == CONSTANT_STATE and base.key not in keys:
                 starts.append(base)
         return starts
 
@@ -426,34 +427,47 @@ class Search:
             self._consider_correction(structure)
 
     def _consider_correction(self, structure: Structure) -> None:
-        """Considers a correction with the penalty that is best of each group."""
+        """Considers a correction with the penalty that is best of each group.
+
+        A structure whose rollouts diverge in all of a fold has none.
+        """
         key = replace(structure, penalties=((0.0,),)).key
         if key not in self._memory:
-            self._memory[key] = self._choose_penalties(structure)
+            by_fold = self._held_out_rollouts(structure)
+            if not all(len(rollouts.windows) for rollouts in by_fold):
+                return
+            rollouts = _concatenated(by_fold)
+            self._memory[key] = self._choose_penalties(structure, rollouts)
         penalties = [tuple(map(float, row)) for row in self._memory[key]["penalties"]]
         errors = np.array(self._memory[key]["errors"])
         self._enter(replace(structure, penalties=tuple(penalties)), errors)
 
-    def _choose_penalties(self, structure: Structure) -> dict[str, list[list[float]]]:
+    def _choose_penalties(
+        self, structure: Structure, rollouts: "_Rollouts"
+    ) -> dict[str, list[list[float]]]:
         """Returns the best penalties (judged steps, groups) of a correction.
 
-        The errors that it has with them come along. They are those of chunks of
-        held-out rollouts, by corrections that were fitted to the other chunks.
+        The errors that it has with them come along: each run, or block of one, is
+        corrected by what the others say. Windows of the same run are no test of a
+        correction, which follows what is common to them.
+
+        Args:
+            structure: That is corrected.
+            rollouts: Of all that was held out.
         """
-        rollouts = _concatenated(self._held_out_rollouts(structure))
         without = self._log.space.distances(
             rollouts.windows.errors(rollouts.predicted, self.judged_steps)
         )
         alternatives = [np.full(self._scale.shape, one) for one in _PENALTIES]
         distances = np.empty((len(_PENALTIES), *without.shape))
-        for chunk in _chunks(rollouts.windows, self._steps):
+        for is_own in _parts_of_whole_runs(rollouts.windows):
             corrections = self._corrections(
-                rollouts[chunk.others], self.judged_steps, alternatives
+                rollouts[~is_own], self.judged_steps, alternatives
             )
-            own = rollouts[chunk.own]
+            own = rollouts[is_own]
             for i, correction in enumerate(corrections):
                 corrected = correction(own.windows, own.predicted)
-                distances[i, chunk.own] = self._log.space.distances(
+                distances[i, is_own] = self._log.space.distances(
                     own.windows.errors(corrected, self.judged_steps)
                 )
         ratios = distances.mean(axis=1) / without.mean(axis=0)
@@ -721,37 +735,32 @@ class Search:
         return NominalFit(model, np.concatenate(errors))
 
 
-class _Chunk(NamedTuple):
-    """Windows that follow each other, and others that share no row with them."""
-
-    own: np.ndarray
-    others: np.ndarray
-
-
-def _chunks(windows: Windows, steps: int) -> list[_Chunk]:
-    """Cuts windows into chunks in their order."""
-    rows = np.arange(len(windows))
-    overlap = -(-(windows.past + steps) // windows.stride)
-    chunks = []
-    for own in np.array_split(rows, min(_CHUNKS, len(windows))):
-        is_apart = (rows < own[0] - overlap) | (rows > own[-1] + overlap)
-        others = rows[is_apart]
-        if not len(others):
-            others = np.setdiff1d(rows, own)
-        chunks.append(_Chunk(own, others))
-    return chunks
+def _parts_of_whole_runs(windows: Windows) -> list[np.ndarray]:
+    """Deals runs to parts; returns which windows are of each (W,)."""
+    runs = np.unique(windows.runs)
+    parts = np.array_split(runs, min(_PARTS, len(runs)))
+    return [np.isin(windows.runs, part) for part in parts]
 
 
 def _concatenated(parts: Sequence[_Rollouts]) -> _Rollouts:
-    """Concatenates rollouts, those of the first part first."""
+    """Concatenates rollouts of different runs, those of the first part first.
+
+    The runs are numbered anew.
+    """
     windows = [part.windows for part in parts]
+    runs = []
+    first = 0
+    for one in windows:
+        numbers, numbered = np.unique(one.runs, return_inverse=True)
+        runs.append(first + numbered)
+        first += len(numbers)
     joined = replace(
         windows[0],
         stride=min(one.stride for one in windows),
         states=np.concatenate([one.states for one in windows]),
         inputs=np.concatenate([one.inputs for one in windows]),
         context=np.concatenate([one.context for one in windows]),
-        runs=np.concatenate([one.runs for one in windows]),
+        runs=np.concatenate(runs),
         times=np.concatenate([one.times for one in windows]),
     )
     return _Rollouts(joined, np.concatenate([part.predicted for part in parts]))

@@ -51,7 +51,7 @@ def tanks(seed, rows=700, noise=0.01):
 
 
 def arx_error(train, windows, order, steps):
-    """Mean error of rollouts of the best linear model of so many rows one step ahead."""
+    """Mean error of rollouts of the linear model that is best one step ahead."""
     run = train.runs[0]
     y = run.states[:, 0]
     u = run.inputs[:, 0]
@@ -84,6 +84,13 @@ def test_outputs_alone_are_learned_with_their_past(tmp_path):
     save_learned(learned, tmp_path / "model.safetensors")
     loaded = load_learned(tmp_path / "model.safetensors").model
     np.testing.assert_allclose(loaded.rollout(windows), model.rollout(windows))
+
+
+def test_gps_are_tried_upon_a_still_state_beside_the_best_structure():
+    runs = [replace(tanks(seed, 240).runs[0], name=f"{seed}") for seed in range(6)]
+    learned = learn(replace(tanks(0), runs=tuple(runs)), points=20, steps=40)
+    names = [candidate.name for candidate in learned.candidates]
+    assert any(name.startswith("constant state, GP on y") for name in names)
 
 
 def with_memory(log, memory=ROWS):
