@@ -3,8 +3,8 @@
     .venv/bin/python -m benchmarks.log_models [--plants pendulum ...] [--seeds 1]
     .venv/bin/python -m benchmarks.log_models --flights FOLDER [--splits 6]
 
-Six simulated plants (``log_plants``): 60 s of excited runs with noise on every state, at
-100 Hz; the model is learned from the first 48 s and judged on the last 12 s. With
+Six simulated plants (``log_plants``): 60 s of excited runs with noise on every state,
+at 100 Hz; the model is learned from the first 48 s and judged on the last 12 s. With
 ``--flights``, the airborne flights of NanoBench in a folder (Ullah and Baca, 2026,
 arXiv:2603.09908; not part of this package), two held out of each split. A line for each
 group of states and step ahead: the model's mean error, over that of the best baseline,

@@ -72,7 +72,7 @@ def _fit_term(model: LogModel, log: Log, steps: int) -> LogModel:
 
 
 def _has_equal_nominal_part(one: LogModel, other: LogModel) -> bool:
-    """Returns whether two models have the same nominal part and lags, the one fitted."""
+    """Returns whether two models have the same nominal part and the same lags."""
     same = one.nominal == other.nominal and one.lag == other.lag
     return same and len(one.time_constants) == len(other.time_constants)
 

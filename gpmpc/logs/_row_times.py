@@ -16,7 +16,8 @@ def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | N
     Its step is ``time.step``, or that of its ``rate`` where a table has no stamps.
 
     Raises:
-        DataError: The column that ``time.step`` names does not hold one positive number.
+        DataError: The column that ``time.step`` names does not hold one positive
+            number.
     """
     step = mapping.time_step
     if isinstance(step, str):

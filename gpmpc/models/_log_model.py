@@ -342,7 +342,7 @@ class LogModel:
     def _residuals(
         self, windows: Windows, rows: slice, theta: Any, time_constants: Any
     ) -> Array:
-        """Computes measured minus modelled outputs (..., W, rows, o), without memory."""
+        """Computes measured minus modelled outputs (..., W, rows, o); no memory."""
         states = windows.states[:, rows]
         next_states = windows.states[:, rows.start + 1 : rows.stop + 1]
         inputs, _ = self.acting_inputs(windows, rows, time_constants)
