@@ -179,40 +179,59 @@ def log_model_of_parts(
         DataError: The parts do not belong together.
     """
     state_values, input_values, context_values, *_ = header["names"]
-    input_names = texts("input_names", input_values)
-    context_names = texts("context_names", context_values)
     kinematics = _kinematics(header["kinematics"], _space(header["groups"]))
-    log = _LogOfNominal(
+    log = _LogOfModel(
         path=path,
         kinematics=kinematics,
         state_names=texts("state_names", state_values),
-        input_names=input_names,
-        context_names=context_names,
+        input_names=texts("input_names", input_values),
+        context_names=texts("context_names", context_values),
         time_step=header["time_step"],
         trusted=tuple(trusted),
     )
+    model = _model(header, tensors, log)
+    noise = OutputNoise(
+        outputs=tensors["noise/outputs"].numpy(),
+        measurement=tensors["noise/measurement"].numpy(),
+    )
+    _check_noise(noise, kinematics)
+    named = NamedLogModel(
+        model=model,
+        noise=noise,
+        state_names=log.state_names,
+        input_names=log.input_names,
+        context_names=log.context_names,
+        time_step=log.time_step,
+    )
+    _check_named(named)
+    return named
+
+
+def _model(
+    header: Mapping[str, Any], tensors: Mapping[str, Tensor], log: "_LogOfModel"
+) -> LogModel:
+    """Makes the model of a header and tensors, and checks its sizes.
+
+    Raises:
+        DataError: The parts do not belong together.
+    """
+    kinematics = log.kinematics
+    input_names = log.input_names
     features = kinematics.features(
         states=kinematics.space.origin[None],
         inputs=np.zeros((1, len(input_names))),
-        context=np.zeros((1, len(context_names))),
+        context=np.zeros((1, len(log.context_names))),
     )
     feature_count = features.shape[1]
     memory = _memory(header.get("memory"))
     regressor_count = memory.regressor_dim(feature_count, len(header["history"]))
-    gps = []
-    for i, (outputs, posterior_header, *sees_memory) in enumerate(header["gps"]):
-        posterior_tensors = tensors_below(f"gp{i}", tensors)
-        posterior = posterior_of_parts(path, posterior_header, posterior_tensors)
-        gps.append(OutputGP(tuple(outputs), posterior, any(sees_memory)))
-        seen = regressor_count - 1 if gps[-1].sees_memory else feature_count
-        _check_gp(gps[-1], seen)
     model = LogModel(
         kinematics=kinematics,
         nominal=_nominal(header["nominal"], log),
         theta=tensors["theta"].numpy(),
         history=tuple(header["history"]),
         lag=header["lag"],
-        gps=tuple(gps),
+        gps=_gps(header["gps"], tensors, log.path),
         correction=_correction(header, tensors, kinematics, input_names, feature_count),
         start_filter=_start_filter(tensors, kinematics, input_names, feature_count),
         time_constants=_numbers(tensors, "time_constants", (0,)),
@@ -220,23 +239,23 @@ def log_model_of_parts(
         weights=_numbers(tensors, "weights", (0, 0)),
         without_nominal=tuple(header.get("without_nominal", ())),
     )
-    noise = OutputNoise(
-        outputs=tensors["noise/outputs"].numpy(),
-        measurement=tensors["noise/measurement"].numpy(),
-    )
-    named = NamedLogModel(
-        model=model,
-        noise=noise,
-        state_names=texts("state_names", state_values),
-        input_names=input_names,
-        context_names=context_names,
-        time_step=header["time_step"],
-    )
-    _check_named(named)
+    for gp in model.gps:
+        _check_gp(gp, regressor_count - 1 if gp.sees_memory else feature_count)
     _check_model(model, feature_count)
     _check_past(model, len(input_names), regressor_count)
-    _check_noise(noise, kinematics)
-    return named
+    return model
+
+
+def _gps(
+    headers: Any, tensors: Mapping[str, Tensor], path: Path
+) -> tuple[OutputGP, ...]:
+    """Makes the GPs of a model of their headers and tensors."""
+    gps = []
+    for i, (outputs, posterior_header, *sees_memory) in enumerate(headers):
+        posterior_tensors = tensors_below(f"gp{i}", tensors)
+        posterior = posterior_of_parts(path, posterior_header, posterior_tensors)
+        gps.append(OutputGP(tuple(outputs), posterior, any(sees_memory)))
+    return tuple(gps)
 
 
 def _memory(fields: Any) -> Memory:
@@ -296,8 +315,8 @@ def _kinematics(name: str, space: StateSpace) -> Kinematics:
     return RigidBodyKinematics(space)
 
 
-class _LogOfNominal(NamedTuple):
-    """What a nominal model in a file is of, and whose code the file may name."""
+class _LogOfModel(NamedTuple):
+    """What a model in a file is of, and whose code the file may name."""
 
     path: Path
     kinematics: Kinematics
@@ -309,7 +328,7 @@ class _LogOfNominal(NamedTuple):
 
 
 def _nominal(
-    name_and_settings: Any, log: _LogOfNominal
+    name_and_settings: Any, log: _LogOfModel
 ) -> MultirotorNominal | AffineNominal | GroupedNominal | SystemNominal:
     """Makes a nominal model of its name and settings.
 
@@ -344,7 +363,7 @@ def _nominal(
     return MultirotorNominal(**settings)
 
 
-def _system_nominal(settings: Mapping[str, Any], log: _LogOfNominal) -> SystemNominal:
+def _system_nominal(settings: Mapping[str, Any], log: _LogOfModel) -> SystemNominal:
     """Makes a system of the code and the parameters that a file names.
 
     Raises:

@@ -26,7 +26,7 @@ class KinematicBicycle:
 
     curvature: float = 1.0  #: of the path, per tangent of the steering: 1 / wheelbase
     rear_length: float = 0.0  #: from the rear axle to where the position is taken [m]
-    steering_offset: float = 0.0  #: added to the steering [rad]
+    steering_offset: float = 0.0  #: added to the steering, in its unit
     steering_scale: float = 1.0  #: angle of a unit of steering [rad]
     drive_gain: float = 1.0  #: acceleration of a unit of drive [m/s2]
     drive_offset: float = 0.0  #: acceleration without drive [m/s2]
@@ -124,37 +124,35 @@ class DifferentialDrive:
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (x, y, heading) [m/s, m/s, rad/s]."""
+        speed, turn_rate = self.motion(u)
+        return [speed * cos(x[2]), speed * sin(x[2]), turn_rate]
+
+    def motion(self, u: Any) -> tuple[Any, Any]:
+        """Computes the speed [m/s] and the turn rate [rad/s] that inputs ask for."""
         speed = self.forward_by_first * u[0] + self.forward_by_second * u[1]
-        turn = self.turn_by_first * u[0] + self.turn_by_second * u[1]
-        return [speed * cos(x[2]), speed * sin(x[2]), turn + self.turn_offset]
+        turn_rate = self.turn_by_first * u[0] + self.turn_by_second * u[1]
+        return speed, turn_rate + self.turn_offset
 
 
 @explains_arguments
 @dataclass(frozen=True)
-class LaggedDifferentialDrive:
+class LaggedDifferentialDrive(DifferentialDrive):
     """A robot on two wheels whose speed and turn rate follow what they are told."""
 
-    forward_by_first: float = 1.0  #: speed of a unit of the first input [m/s]
-    forward_by_second: float = 0.0  #: of the second
-    turn_by_first: float = 0.0  #: turn rate of a unit of the first input [rad/s]
-    turn_by_second: float = 1.0  #: of the second
-    turn_offset: float = 0.0  #: turn rate without inputs [rad/s]
     speed_decay: float = 3.0  #: one over the time constant of the speed [1/s]
     turn_decay: float = 3.0  #: of the turn rate [1/s]
 
     state_names = ("x", "y", "heading", "speed", "turn_rate")
-    input_names = ("first", "second")
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt of the state [m/s, m/s, rad/s, m/s^2, rad/s^2]."""
-        speed = self.forward_by_first * u[0] + self.forward_by_second * u[1]
-        turn = self.turn_by_first * u[0] + self.turn_by_second * u[1]
+        speed, turn_rate = self.motion(u)
         return [
             x[3] * cos(x[2]),
             x[3] * sin(x[2]),
             x[4],
             self.speed_decay * (speed - x[3]),
-            self.turn_decay * (turn + self.turn_offset - x[4]),
+            self.turn_decay * (turn_rate - x[4]),
         ]
 
 
