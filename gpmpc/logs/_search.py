@@ -5,7 +5,7 @@
 2. Groups of outputs: those of one nominal structure, the others of another.
 3. GPs on the groups of outputs, from none and from all at once, by the change of one
    group at a time that helps most.
-4. A correction by the past, upon the best structures and upon a state that stays.
+4. A correction by the past upon the best structures, unless they have a memory.
 
 A structure's score is the mean, over groups and steps, of the logarithm of its error
 over that of the best baseline; where it is behind, that counts twice.
@@ -415,7 +415,7 @@ class Search:
     # 4. corrections by the past
 
     def _search_corrections(self) -> None:
-        """Considers corrections upon the best structures and upon a constant state.
+        """Considers corrections upon the best structures.
 
         A memory holds the past already. A correction upon it follows the runs that it
         was fitted to, and predicts others worse.

@@ -157,9 +157,9 @@ class SavedModel:
         """Raises ``SettingError`` unless a system has as many states or inputs."""
         expected = system.state_names if key == "states" else system.input_names
         if dim != len(expected):
-            found = f"the {key} {', '.join(names) or dim}"
+            content = f"the {key} {', '.join(names) or dim}"
             rule = f"{system.name} has {', '.join(expected)}"
-            raise SettingError("model", f"{self.path} has {found}; {rule}")
+            raise SettingError("model", f"{self.path} has {content}; {rule}")
 
 
 def load_flyable(path: str | Path, trusted: Sequence[str] | None = None) -> SavedModel:

@@ -50,9 +50,9 @@ class FirstOrderLags(NamedTuple):
         lagged = inputs[..., 0, :]
         acting = []
         for k in range(inputs.shape[-2]):
-            held = inputs[..., k, :]
-            acting.append(self.acting(lagged, held))
-            lagged = self.after(lagged, held)
+            command = inputs[..., k, :]
+            acting.append(self.acting(lagged, command))
+            lagged = self.after(lagged, command)
         if not acting:
             return inputs, lagged
         return np.stack(acting, axis=-2), lagged
