@@ -88,7 +88,6 @@ def definitions(
         "GPMPC_INCREMENTAL": settings.is_incremental,
         "GPMPC_ESTIMATES": gain > 0,
         "GPMPC_HOLDS": on_failure == "hold",
-        "GPMPC_FEEDBACK_COORDINATES": True,
     }
     values = {
         "GPMPC_STATES": str(prediction.state_dim),

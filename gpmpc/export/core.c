@@ -43,7 +43,8 @@ static void fill(real *x, real value, int size)
         x[i] = value;
 }
 
-/* x'y; long ones in eight interleaved parts, which need not wait for each other */
+/* x'y; long ones in eight interleaved parts, which need not wait for each other. Those
+   of GPs are summed in parts at every length and in double: ``wide_dot``. */
 static real dot(const real *x, const real *y, int size)
 {
     real total = 0;
@@ -100,7 +101,7 @@ static void add_transposed_product(const real *A, const real *B, int inner, int 
             add_scaled(A[j * rows + i], B + j * columns, out + i * columns, columns);
 }
 
-/* a <- a + A b for angles: whole turns in a difference of angles */
+/* The whole turns in a difference of angles. */
 static real whole_turns(real angle)
 {
     const real turn = REAL(6.283185307179586476925286766559);
@@ -144,12 +145,16 @@ static int solve_positive(real *A, int size, real *X, int columns)
 
 enum { INPUTS, DEVIATIONS, INCREMENTS }; /* what R weighs */
 
-/* Weight Q (n, n) of s_{k+1}; that of s_H is the terminal one. */
+/* Weight Q (n, n) of s_{k+1} on the way. */
+static const real *running_weight(int k)
+{
+    return state_weights + (GPMPC_STATE_WEIGHTS > 1 ? k : 0) * n * n;
+}
+
+/* Weight (n, n) of s_{k+1}; that of s_H is the terminal one. */
 static const real *weight_of_stage(int k)
 {
-    if (k == H - 1)
-        return terminal_weight;
-    return state_weights + (GPMPC_STATE_WEIGHTS > 1 ? k : 0) * n * n;
+    return k == H - 1 ? terminal_weight : running_weight(k);
 }
 
 /* Weight R (m, m) of the input of stage k. */
@@ -161,7 +166,24 @@ static const real *input_weight(int k)
 /* Index of the stage model of stage k: of H, or the one that is held. */
 static int stage_of(int k) { return GPMPC_STAGES > 1 ? k : 0; }
 
-/* The means x_1 .. x_H of the last plan, one step on, in the turn of the state. */
+/* An input within its box at stage k. */
+static real within_box(real u, int k, int i)
+{
+    return smaller(larger(u, input_lower[k * m + i]), input_upper[k * m + i]);
+}
+
+/* An input within its rates from the one before it, where there are any. */
+static real within_rates(real u, real last, int k, int i)
+{
+    if (!GPMPC_HAS_RATES)
+        return u;
+    return smaller(larger(u, last + rate_lower[k * m + i]),
+                   last + rate_upper[k * m + i]);
+}
+
+/* Entry i of what the last plan means for stage k: its mean one step later, the last
+   one repeated. An angle, which may be counted from another turn since, is moved by the
+   full turns between the state and the mean that was predicted for it. */
 static real continued_mean(const gpmpc_controller *controller, const real *state,
                            int k, int i, const int *angles, int count)
 {
@@ -197,47 +219,50 @@ static void read_reference(gpmpc_controller *controller, const real *state,
                 reference->has_inputs ? reference->inputs[k][i] : 0;
 }
 
-/* The first guess: the last plan, one step on. Without one a line from the state to the
-   last reference, and the previous input. */
-static void guess_plan(gpmpc_controller *controller, const real *state,
-                       const gpmpc_reference *reference)
+/* The states of the first guess: the last plan, one step on. Without one a line from
+   the state to the last reference. Form velocity holds the state. */
+static void guess_states(gpmpc_controller *controller, const real *state)
 {
     gpmpc_problem *problem = &controller->problem;
     int k, i;
     copy(state, problem->states[0], n);
-    for (k = 1; k <= H; k++)
+    for (k = 1; k <= H; k++) {
+        real remaining = 1 - (real)k * ((real)1 / H);
         for (i = 0; i < n; i++) {
             real mean;
-            if (GPMPC_STAGES == 1 && GPMPC_HELD)
+            if (GPMPC_HELD)
                 mean = state[i];
             else if (controller->has_plan)
                 mean = continued_mean(controller, state, k, i, state_angles,
                                       GPMPC_STATE_ANGLE_COUNT);
             else
                 mean = problem->targets[k][i]
-                       + (1 - (real)k * ((real)1 / H)) * (state[i] - problem->targets[1][i]);
+                       + remaining * (state[i] - problem->targets[1][i]);
             problem->states[k][i] = mean;
         }
+    }
+}
+
+/* Its inputs, within bounds and rates: the last plan, one step on. Without one those of
+   the reference where deviations from them are weighed, else the previous input. Form
+   velocity holds the previous input. */
+static void guess_inputs(gpmpc_controller *controller)
+{
+    gpmpc_problem *problem = &controller->problem;
+    int k, i;
     for (k = 0; k < H; k++)
         for (i = 0; i < m; i++) {
+            real last = k > 0 ? problem->inputs[k - 1][i] : problem->previous_input[i];
             real input = problem->previous_input[i];
-            if (controller->has_plan)
-                input = controller->inputs[k + 1 < H ? k + 1 : H - 1][i];
-            else if (GPMPC_PENALIZED == DEVIATIONS && !GPMPC_HELD)
-                input = reference->inputs[k][i];
             if (GPMPC_HELD) {
-                problem->inputs[k][i] = problem->previous_input[i];
+                problem->inputs[k][i] = input;
                 continue;
             }
-            input = smaller(larger(input, input_lower[k * m + i]),
-                            input_upper[k * m + i]);
-            if (GPMPC_HAS_RATES) {
-                real last = k > 0 ? problem->inputs[k - 1][i]
-                                  : problem->previous_input[i];
-                input = smaller(larger(input, last + rate_lower[k * m + i]),
-                                last + rate_upper[k * m + i]);
-            }
-            problem->inputs[k][i] = input;
+            if (controller->has_plan)
+                input = controller->inputs[k + 1 < H ? k + 1 : H - 1][i];
+            else if (GPMPC_PENALIZED == DEVIATIONS)
+                input = problem->target_inputs[k][i];
+            problem->inputs[k][i] = within_rates(within_box(input, k, i), last, k, i);
         }
 }
 
@@ -307,7 +332,6 @@ static void write_increments(gpmpc_controller *controller)
 }
 #endif
 
-#if GPMPC_TUBES || GPMPC_ROLLS_OUT || GPMPC_FEEDBACK_COORDINATES
 /* One stage of the Riccati recursion, from P_{k+1} to P_k (size, size):
 
      D = R + B'P B,   K = D^-1 B'P A
@@ -347,7 +371,6 @@ static void riccati(const real *A, const real *B, const real *Q, const real *R,
             P[j * size + i] = value;
         }
 }
-#endif
 
 #if GPMPC_TUBES || GPMPC_ROLLS_OUT
 /* Gains K_k of u = u_k - K_k (x - x_k), the regulator of the plan's own stages. */
@@ -433,14 +456,21 @@ static real row_value(const gpmpc_problem *problem, int k, int e, const real *s,
     return value;
 }
 
-/* Writes the rows at the plan: smooth ones linearised, bounds moved inwards by
-   kappa sqrt(F Sigma F'). Returns whether all functions are finite. */
-static int write_rows(gpmpc_problem *problem, const gpmpc_reference *reference)
+/* By how much E s_{k+1} + D u_k misses a bound of its row; negative inside. */
+static real row_miss(const gpmpc_problem *problem, int k, int e, const real *s,
+                     const real *u)
 {
+    real value = row_value(problem, k, e, s, u);
+    return larger(value - problem->row_upper[k][e], problem->row_lower[k][e] - value);
+}
+
+#if GPMPC_SMOOTH
+/* Writes the smooth rows, linearised at the plan. Returns whether they are finite. */
+static int write_smooth_rows(gpmpc_problem *problem, const gpmpc_reference *reference)
+{
+    real h[GPMPC_ROWS];
     int finite = 1;
     int k, e;
-#if GPMPC_SMOOTH
-    real h[GPMPC_ROWS];
     for (k = 0; k < H; k++) {
         copy(row_gradients, &problem->E[k][0][0], r * n);
         fill(&problem->D[k][0][0], 0, r * m);
@@ -448,8 +478,6 @@ static int write_rows(gpmpc_problem *problem, const gpmpc_reference *reference)
                     reference->parameters[k], h, &problem->E[k][0][0],
                     &problem->D[k][0][0]);
         for (e = 0; e < r; e++) {
-            problem->row_lower[k][e] = row_lower[k * r + e];
-            problem->row_upper[k][e] = row_upper[k * r + e];
             if (!row_is_smooth[e])
                 continue;
             finite = finite && is_finite(h[e]) && all_finite(problem->E[k][e], n)
@@ -459,21 +487,20 @@ static int write_rows(gpmpc_problem *problem, const gpmpc_reference *reference)
                                         + dot(problem->D[k][e], problem->inputs[k], m);
         }
     }
-#else
-    (void)reference;
-    for (k = 0; k < H; k++)
-        for (e = 0; e < r; e++) {
-            problem->row_lower[k][e] = row_lower[k * r + e];
-            problem->row_upper[k][e] = row_upper[k * r + e];
-        }
+    return finite;
+}
 #endif
+
 #if GPMPC_TUBES
+/* Moves the bounds of the rows inwards by kappa sqrt(F Sigma F'). */
+static void tighten_rows(gpmpc_problem *problem)
+{
+    int k, e, i;
     for (k = 0; k < H; k++)
         for (e = 0; e < r; e++) {
             const real *F = ROW_BY_STATE(problem, k, e);
             real variance = 0;
             real margin;
-            int i;
             for (i = 0; i < n; i++)
                 if (F[i] != 0)
                     variance += F[i] * dot(problem->covariances[k + 1][i], F, n);
@@ -481,8 +508,28 @@ static int write_rows(gpmpc_problem *problem, const gpmpc_reference *reference)
             problem->row_lower[k][e] += margin;
             problem->row_upper[k][e] -= margin;
         }
+}
 #endif
+
+/* Writes the rows at the plan, with their prices. Returns whether all functions are
+   finite. */
+static int write_rows(gpmpc_problem *problem, const gpmpc_reference *reference)
+{
+    int finite = 1;
+    int k;
+    for (k = 0; k < H; k++) {
+        copy(row_lower + k * r, problem->row_lower[k], r);
+        copy(row_upper + k * r, problem->row_upper[k], r);
+    }
     copy(row_prices, problem->prices, r);
+#if GPMPC_SMOOTH
+    finite = write_smooth_rows(problem, reference);
+#else
+    (void)reference;
+#endif
+#if GPMPC_TUBES
+    tighten_rows(problem);
+#endif
     return finite;
 }
 
@@ -493,11 +540,9 @@ static real largest_violation(const gpmpc_problem *problem)
     int k, e, i;
     for (k = 0; k < H; k++) {
         const real *u = problem->inputs[k];
-        for (e = 0; e < r; e++) {
-            real value = row_value(problem, k, e, problem->states[k + 1], u);
-            largest = larger(largest, larger(value - problem->row_upper[k][e],
-                                             problem->row_lower[k][e] - value));
-        }
+        for (e = 0; e < r; e++)
+            largest =
+                larger(largest, row_miss(problem, k, e, problem->states[k + 1], u));
         for (i = 0; i < m; i++) {
             largest = larger(largest, larger(u[i] - input_upper[k * m + i],
                                              input_lower[k * m + i] - u[i]));
@@ -519,12 +564,10 @@ static int keeps_hard_rows(const gpmpc_problem *problem)
     int k, e;
     for (k = 0; k < H; k++)
         for (e = 0; e < r; e++) {
-            real value =
-                row_value(problem, k, e, problem->states[k + 1], problem->inputs[k]);
-            real missed = larger(value - problem->row_upper[k][e],
-                                 problem->row_lower[k][e] - value);
-            if (row_prices[e] > LARGEST && missed > 0)
-                total += missed;
+            real miss =
+                row_miss(problem, k, e, problem->states[k + 1], problem->inputs[k]);
+            if (row_prices[e] > LARGEST && miss > 0)
+                total += miss;
         }
     return total <= FEASIBLE;
 }
@@ -666,6 +709,28 @@ static void write_bounds(const gpmpc_problem *problem, const real *inputs,
     }
 }
 
+/* The input from which that of stage k is weighed. */
+static real centre_of_input(const gpmpc_problem *problem, int k, int i)
+{
+    if (GPMPC_PENALIZED == DEVIATIONS)
+        return problem->target_inputs[k][i];
+    if (GPMPC_PENALIZED == INCREMENTS && k == 0)
+        return problem->previous_input[i];
+    return 0;
+}
+
+/* Writes s_0 .. s_H without input. */
+static void write_free_states(const gpmpc_problem *problem, real *states)
+{
+    int k, i;
+    copy(problem->states[0], states, n);
+    for (k = 0; k < H; k++)
+        for (i = 0; i < n; i++)
+            states[(k + 1) * n + i] =
+                problem->c[stage_of(k)][i]
+                + dot(problem->A[stage_of(k)][i], states + k * n, n);
+}
+
 /* Writes q by the adjoint recursion, and the bounds. */
 static void write_gradient(gpmpc_controller *controller)
 {
@@ -677,23 +742,14 @@ static void write_gradient(gpmpc_controller *controller)
     real gradient[GPMPC_STATES];
     real costate[GPMPC_STATES]; /* A_k' times the gradient by s_{k+1} */
     int k, i, j;
-    copy(problem->states[0], free_states, n);
-    for (k = 0; k < H; k++)
-        for (i = 0; i < n; i++)
-            free_states[(k + 1) * n + i] =
-                problem->c[stage_of(k)][i]
-                + dot(problem->A[stage_of(k)][i], free_states + k * n, n);
+    write_free_states(problem, free_states);
     fill(program->q, 0, N);
     fill(costate, 0, n);
     for (k = H - 1; k >= 0; k--) {
         const real *state = free_states + (k + 1) * n;
         real *q = program->q + k * m;
         for (j = 0; j < m; j++) {
-            real centre = 0;
-            if (GPMPC_PENALIZED == DEVIATIONS)
-                centre = problem->target_inputs[k][j];
-            else if (GPMPC_PENALIZED == INCREMENTS && k == 0)
-                centre = problem->previous_input[j];
+            real centre = centre_of_input(problem, k, j);
             for (i = 0; i < m; i++)
                 q[i] -= 2 * input_weight(k)[i * m + j] * centre;
         }
@@ -722,7 +778,6 @@ static void write_gradient(gpmpc_controller *controller)
     write_bounds(problem, no_inputs, free_states, 0, program);
 }
 
-#if GPMPC_FEEDBACK_COORDINATES
 /* Writes one stage of [s_k - r_k; u_{k-1}; 1] and its weight, of ``size`` entries. */
 static void write_augmented(const gpmpc_problem *problem, int k, int size, real *A,
                             real *B)
@@ -812,71 +867,8 @@ static void write_feedback(gpmpc_problem *problem)
     }
 }
 
-/* Writes the inputs and states of unknowns v. */
-static void expand(const gpmpc_problem *problem, const real *unknowns, real *inputs,
-                   real *states);
-
-/* Writes the program in feedback coordinates: P is block diagonal, q zero, and the
-   bounds of inputs are rows. */
-static void condense_with_feedback(gpmpc_controller *controller)
-{
-    gpmpc_problem *problem = &controller->problem;
-    gpmpc_program *program = &controller->program;
-    real inputs[GPMPC_SIZE];
-    real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
-    real row[GPMPC_SIZE];
-    int k, i, j, e;
-    int now = 0;
-    write_feedback(problem);
-    problem->has_feedback = 1;
-    program->rows = GPMPC_G_ROWS;
-    fill(&program->P[0][0], 0, N * N);
-    fill(&program->G[0][0], 0, GPMPC_G_ROWS * N);
-    fill(program->q, 0, N);
-    fill(&problem->gamma[0][0][0], 0, 2 * (n + m) * N);
-    for (k = 0; k < H; k++) {
-        /* derivatives by v of s_k and u_{k-1}, and of s_{k+1} and u_k */
-        real(*response)[GPMPC_SIZE] = problem->gamma[now];
-        real(*next)[GPMPC_SIZE] = problem->gamma[1 - now];
-        int here = k * m;
-        int width = here + m;
-        for (i = 0; i < m; i++) {
-            for (j = 0; j < m; j++)
-                program->P[here + i][here + j] = 2 * problem->hessians[k][i][j];
-            fill(next[n + i], 0, N);
-            for (j = 0; j < n + m; j++)
-                add_scaled(problem->feedback[k][i][j], response[j], next[n + i], here);
-            next[n + i][here + i] = 1;
-            copy(next[n + i], program->G[here + i], width);
-            if (GPMPC_HAS_RATES)
-                for (j = 0; j < width; j++)
-                    program->G[N + here + i][j] = next[n + i][j] - response[n + i][j];
-        }
-        for (i = 0; i < n; i++) {
-            fill(next[i], 0, N);
-            for (j = 0; j < n; j++)
-                add_scaled(problem->A[stage_of(k)][i][j], response[j], next[i], width);
-            for (j = 0; j < m; j++)
-                add_scaled(problem->B[stage_of(k)][i][j], next[n + j], next[i], width);
-        }
-        for (e = 0; e < r; e++) {
-            fill(row, 0, width);
-            for (j = 0; j < n; j++)
-                add_scaled(ROW_BY_STATE(problem, k, e)[j], next[j], row, width);
-#if GPMPC_SMOOTH
-            for (j = 0; j < m; j++)
-                add_scaled(problem->D[k][e][j], next[n + j], row, width);
-#endif
-            copy(row, program->G[N + GPMPC_RATE_ROWS + k * r + e], width);
-        }
-        now = 1 - now;
-    }
-    expand(problem, program->q, inputs, states);
-    write_bounds(problem, inputs, states, N, program);
-}
-#endif
-
-/* u_k = F_k [s_k; u_{k-1}; 1] + v_k (or v_k), s_{k+1} = A_k s_k + B_k u_k + c_k */
+/* Writes the inputs and states of unknowns v:
+   u_k = F_k [s_k; u_{k-1}; 1] + v_k (or v_k), s_{k+1} = A_k s_k + B_k u_k + c_k */
 static void expand(const gpmpc_problem *problem, const real *unknowns, real *inputs,
                    real *states)
 {
@@ -899,6 +891,75 @@ static void expand(const gpmpc_problem *problem, const real *unknowns, real *inp
                                       + dot(problem->A[stage_of(k)][i], s, n)
                                       + dot(problem->B[stage_of(k)][i], u, m);
     }
+}
+
+/* Writes the derivatives by v of s_{k+1} and u_k, ``next``, from those of s_k and
+   u_{k-1}, ``response``. */
+static void write_response(const gpmpc_problem *problem, int k,
+                           real (*response)[GPMPC_SIZE], real (*next)[GPMPC_SIZE])
+{
+    int here = k * m;
+    int width = here + m;
+    int i, j;
+    for (i = 0; i < m; i++) {
+        fill(next[n + i], 0, N);
+        for (j = 0; j < n + m; j++)
+            add_scaled(problem->feedback[k][i][j], response[j], next[n + i], here);
+        next[n + i][here + i] = 1;
+    }
+    for (i = 0; i < n; i++) {
+        fill(next[i], 0, N);
+        for (j = 0; j < n; j++)
+            add_scaled(problem->A[stage_of(k)][i][j], response[j], next[i], width);
+        for (j = 0; j < m; j++)
+            add_scaled(problem->B[stage_of(k)][i][j], next[n + j], next[i], width);
+    }
+}
+
+/* Writes the program in feedback coordinates: P is block diagonal, q zero, and the
+   bounds of inputs are rows. */
+static void condense_with_feedback(gpmpc_controller *controller)
+{
+    gpmpc_problem *problem = &controller->problem;
+    gpmpc_program *program = &controller->program;
+    real inputs[GPMPC_SIZE];
+    real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
+    int k, i, j, e;
+    int now = 0;
+    write_feedback(problem);
+    problem->has_feedback = 1;
+    program->rows = GPMPC_G_ROWS;
+    fill(&program->P[0][0], 0, N * N);
+    fill(&program->G[0][0], 0, GPMPC_G_ROWS * N);
+    fill(program->q, 0, N);
+    fill(&problem->gamma[0][0][0], 0, 2 * (n + m) * N);
+    for (k = 0; k < H; k++) {
+        real(*response)[GPMPC_SIZE] = problem->gamma[now];
+        real(*next)[GPMPC_SIZE] = problem->gamma[1 - now];
+        int here = k * m;
+        int width = here + m;
+        write_response(problem, k, response, next);
+        for (i = 0; i < m; i++) {
+            for (j = 0; j < m; j++)
+                program->P[here + i][here + j] = 2 * problem->hessians[k][i][j];
+            copy(next[n + i], program->G[here + i], width);
+            if (GPMPC_HAS_RATES)
+                for (j = 0; j < width; j++)
+                    program->G[N + here + i][j] = next[n + i][j] - response[n + i][j];
+        }
+        for (e = 0; e < r; e++) {
+            real *row = program->G[N + GPMPC_RATE_ROWS + k * r + e];
+            for (j = 0; j < n; j++)
+                add_scaled(ROW_BY_STATE(problem, k, e)[j], next[j], row, width);
+#if GPMPC_SMOOTH
+            for (j = 0; j < m; j++)
+                add_scaled(problem->D[k][e][j], next[n + j], row, width);
+#endif
+        }
+        now = 1 - now;
+    }
+    expand(problem, program->q, inputs, states);
+    write_bounds(problem, inputs, states, N, program);
 }
 
 /* Makes the quadratic program, in the coordinates that suit it: where A grows over the
@@ -926,15 +987,10 @@ static void condense(gpmpc_controller *controller)
             int last = N - m + i;
             growth += program->P[here][here] / program->P[last][last];
         }
-#if GPMPC_FEEDBACK_COORDINATES
-    if (!(growth <= LARGEST_GROWTH)) {
+    if (growth <= LARGEST_GROWTH)
+        write_gradient(controller);
+    else
         condense_with_feedback(controller);
-        return;
-    }
-#else
-    (void)growth;
-#endif
-    write_gradient(controller);
 }
 
 /*{qp}*/
@@ -990,11 +1046,9 @@ static real elastic_violation(const gpmpc_problem *problem, const real *states,
     int k, e;
     for (k = 0; k < H; k++)
         for (e = 0; e < r; e++) {
-            real value =
-                row_value(problem, k, e, states + (k + 1) * n, inputs + k * m);
+            real miss = row_miss(problem, k, e, states + (k + 1) * n, inputs + k * m);
             if (row_is_elastic[e])
-                largest = larger(largest, larger(value - problem->row_upper[k][e],
-                                                 problem->row_lower[k][e] - value));
+                largest = larger(largest, miss);
         }
     return largest;
 }
@@ -1007,27 +1061,25 @@ static real elastic_price(const gpmpc_problem *problem, const real *states,
 {
     real free_cost = cost_of_plan(problem, states, inputs);
     real cost = smaller(larger(free_cost, last_cost), 2 * free_cost);
-    real sum_missed = 0;
+    real sum_of_misses = 0;
     real beside = 0;
     int k, e, i;
     for (k = 0; k < H; k++)
         for (e = 0; e < r; e++) {
             const real *g = ROW_BY_STATE(problem, k, e);
-            const real *Q = state_weights + (GPMPC_STATE_WEIGHTS > 1 ? k : 0) * n * n;
-            real value = row_value(problem, k, e, states + (k + 1) * n, inputs + k * m);
-            real missed = larger(value - problem->row_upper[k][e],
-                                  problem->row_lower[k][e] - value);
+            const real *Q = running_weight(k);
+            real miss = row_miss(problem, k, e, states + (k + 1) * n, inputs + k * m);
             real weight = 0;
             real square;
-            if (!row_is_elastic[e] || !(missed > 0))
+            if (!row_is_elastic[e] || !(miss > 0))
                 continue;
             for (i = 0; i < n; i++)
                 weight += g[i] * dot(Q + i * n, g, n);
             square = larger(dot(g, g, n), REAL(1e-12));
-            sum_missed += missed;
-            beside += weight / (square * square) * missed * missed;
+            sum_of_misses += miss;
+            beside += weight / (square * square) * miss * miss;
         }
-    return 2 * (cost + beside) / larger(sum_missed, REAL(1e-12));
+    return 2 * (cost + beside) / larger(sum_of_misses, REAL(1e-12));
 }
 
 /* Whether the solution was found, and keeps the elastic rows. */
@@ -1052,8 +1104,8 @@ static void set_elastic_price(gpmpc_problem *problem, real price)
 }
 
 /* Solves the program once more with another price of the elastic rows, where the first
-   solution misses one of them. Where the exact price took more digits than there are,
-   a thousandth of it may do: a row whose multiplier stays below is kept all the same. */
+   solution misses one of them. Where the exact price took more digits than there are, a
+   thousandth of it may do: a row whose multiplier stays below is kept all the same. */
 static void lower_elastic_prices(gpmpc_controller *controller)
 {
     gpmpc_problem *problem = &controller->problem;
@@ -1157,11 +1209,7 @@ static void close_defects(gpmpc_controller *controller)
                                                   : -problem->gains[k][i][j];
                 u += gain * (states[k][j] - problem->states[k][j]);
             }
-            if (GPMPC_HAS_RATES)
-                u = smaller(larger(u, last + rate_lower[k * m + i]),
-                            last + rate_upper[k * m + i]);
-            inputs[k][i] = smaller(larger(u, input_lower[k * m + i]),
-                                   input_upper[k * m + i]);
+            inputs[k][i] = within_box(within_rates(u, last, k, i), k, i);
         }
         model(states[k], inputs[k], problem->model, states[k + 1], 0, 0, 0);
         for (i = 0; i < n && GPMPC_ESTIMATES; i++)
@@ -1174,7 +1222,37 @@ static void close_defects(gpmpc_controller *controller)
 }
 #endif
 
-/* Decides: makes the problem at the first guess, solves its program, and takes its step
+/* Makes the problem at the first guess. Returns whether all functions are finite. */
+static int write_problem(gpmpc_controller *controller, const real *state,
+                         const real *covariance, const gpmpc_reference *reference)
+{
+    gpmpc_problem *problem = &controller->problem;
+    copy(controller->has_input ? controller->input : initial_input,
+         problem->previous_input, m);
+    read_reference(controller, state, reference);
+    if (GPMPC_ESTIMATES)
+        estimate_disturbance(controller, state);
+    guess_states(controller, state);
+    guess_inputs(controller);
+    linearize(controller);
+#if GPMPC_OUTPUTS
+    if (!write_outputs(problem, reference))
+        return 0;
+#endif
+#if GPMPC_TUBES
+    write_gains(problem);
+    predict_covariances(problem, covariance);
+#else
+    (void)covariance;
+#endif
+#if GPMPC_INCREMENTAL
+    if (controller->has_plan)
+        write_increments(controller);
+#endif
+    return write_rows(problem, reference);
+}
+
+/* Decides: solves the program of the problem at the first guess, and takes its step
    whole (the real-time iteration of Diehl, Bock and Schloeder, 2005). Writes plan and
    violation; returns the status, and whether the plan may be applied. */
 static int decide(gpmpc_controller *controller, const real *state,
@@ -1185,27 +1263,7 @@ static int decide(gpmpc_controller *controller, const real *state,
     gpmpc_solution *solution = &controller->candidate;
     int status;
     *applicable = 0;
-    (void)covariance;
-    copy(controller->has_input ? controller->input : initial_input,
-         problem->previous_input, m);
-    read_reference(controller, state, reference);
-    if (GPMPC_ESTIMATES)
-        estimate_disturbance(controller, state);
-    guess_plan(controller, state, reference);
-    linearize(controller);
-#if GPMPC_OUTPUTS
-    if (!write_outputs(problem, reference))
-        return GPMPC_FUNCTION_NOT_FINITE;
-#endif
-#if GPMPC_TUBES
-    write_gains(problem);
-    predict_covariances(problem, covariance);
-#endif
-#if GPMPC_INCREMENTAL
-    if (controller->has_plan)
-        write_increments(controller);
-#endif
-    if (!write_rows(problem, reference))
+    if (!write_problem(controller, state, covariance, reference))
         return GPMPC_FUNCTION_NOT_FINITE;
     condense(controller);
     solve(&controller->program, problem->prices, &controller->solution, solution);
@@ -1238,12 +1296,8 @@ static void keep_bounds(const gpmpc_controller *controller, real *input)
 {
     const real *last = controller->has_input ? controller->input : initial_input;
     int i;
-    for (i = 0; i < m; i++) {
-        if (GPMPC_HAS_RATES)
-            input[i] = smaller(larger(input[i], last[i] + rate_lower[i]),
-                               last[i] + rate_upper[i]);
-        input[i] = smaller(larger(input[i], input_lower[i]), input_upper[i]);
-    }
+    for (i = 0; i < m; i++)
+        input[i] = within_box(within_rates(input[i], last[i], 0, i), 0, i);
 }
 
 /* Applies the first of planned inputs (H, m), put onto the bounds that it misses by
@@ -1350,6 +1404,7 @@ int gpmpc_step_belief(gpmpc_controller *controller, const gpmpc_real mean[GPMPC_
         status = GPMPC_NUMERICAL_TROUBLE;
     }
     if (!applicable) {
+        controller->violation = NAN;
         copy(disturbance, controller->disturbance, n);
         if (!continue_last_plan(controller))
             apply_known_input(controller, reference);

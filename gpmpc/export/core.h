@@ -162,7 +162,7 @@ typedef struct {
     /* how the last step ended */
     int status;
     int failed; /* whether the policy chose its input */
-    gpmpc_real violation; /* by how much its plan misses a bound */
+    gpmpc_real violation; /* by how much its plan misses a bound; NAN where it failed */
     /* memory of a step */
     gpmpc_problem problem;
     gpmpc_program program;

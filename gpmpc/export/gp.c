@@ -1,5 +1,6 @@
-/* The sums of GPs are taken in double whatever the precision is: a GP of smooth dynamics
-   is a sum of large terms that cancel, of which float would leave two digits. */
+/* The sums of GPs are taken in double whatever the precision is: a GP of smooth
+   dynamics is a sum of large terms that cancel, of which float would leave two
+   digits. */
 typedef double wide;
 
 /* The exponential without branch and table (Cody and Waite, 1980): x = j ln 2 + y with
@@ -39,8 +40,8 @@ static wide exponential(wide x)
     return g * power_of_two(half) * power_of_two((j - (half - SHIFT)) + SHIFT);
 }
 
-/* Returns start + sum x_i, in eight interleaved parts as registers of eight numbers take
-   it: where large terms cancel, the order of a sum decides its last digits. */
+/* Returns start + sum x_i, in eight interleaved parts as registers of eight numbers
+   take it: where large terms cancel, the order of a sum decides its last digits. */
 static wide sum(wide start, const wide *x, int size)
 {
     wide parts[8] = {0};
@@ -55,7 +56,7 @@ static wide sum(wide start, const wide *x, int size)
            + (((parts[1] + parts[5]) + (parts[3] + parts[7])) + start);
 }
 
-/* x'y of long vectors */
+/* x'y in the same parts, whatever the length */
 static wide wide_dot(const wide *x, const wide *y, int size)
 {
     wide parts[8] = {0};

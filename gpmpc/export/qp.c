@@ -10,7 +10,7 @@
 
 enum { BATCHES = 4, ROUNDS = 10, REFINEMENTS = 3 };
 
-/* Multipliers that the size of the set bounds: changes of the working set. */
+/* The largest number of changes of the working set. */
 static int iteration_limit(const gpmpc_program *work)
 {
     return GPMPC_ITERATIONS > 0 ? GPMPC_ITERATIONS : 100 + 10 * (N + work->rows);
@@ -523,6 +523,14 @@ static real terms_of_combination(const gpmpc_program *work, int k)
     return terms;
 }
 
+/* Whether p contradicts the working set by more than rounding. */
+static int is_contradiction(const gpmpc_program *work, int p, real terms)
+{
+    real size = larger(larger(absolute(work->value[p]), terms),
+                       work->length_of_q * work->norm[p]);
+    return work->excess[p] * work->norm[p] > HOPELESS * size;
+}
+
 /* Writes Farkas' proof that p contradicts the working set to the multipliers. */
 static void write_ray(gpmpc_program *work, int k, int p)
 {
@@ -636,9 +644,7 @@ static void iterate(gpmpc_program *work, Progress *progress, int starts, int gue
             multipliers_fit = 1;
             if (!satisfied) {
                 real terms = terms_of_combination(work, k);
-                real size = larger(larger(absolute(work->value[p]), terms),
-                                   work->length_of_q * work->norm[p]);
-                if (work->excess[p] * work->norm[p] > HOPELESS * size) {
+                if (is_contradiction(work, p, terms)) {
                     write_ray(work, k, p);
                     progress->status = GPMPC_INFEASIBLE;
                     break;
@@ -842,8 +848,8 @@ static void write_solution(const gpmpc_program *work, const Progress *progress,
 
 /* Solves the opened program in rounds: iterate, refine x on its working set, look for
    violations that are left. */
-static int solve_opened(gpmpc_program *work, const gpmpc_solution *guess,
-                        gpmpc_solution *solution)
+static void solve_opened(gpmpc_program *work, const gpmpc_solution *guess,
+                         gpmpc_solution *solution)
 {
     Progress progress = {GPMPC_NUMERICAL_TROUBLE, 0, 0, BATCHES, 0, 0};
     real margin = LATER * work->length_of_q; /* small ones wait for the refined x */
@@ -896,7 +902,6 @@ static int solve_opened(gpmpc_program *work, const gpmpc_solution *guess,
         && worst_violation(work) > NOISE)
         progress.status = GPMPC_NUMERICAL_TROUBLE;
     write_solution(work, &progress, solution);
-    return progress.status;
 }
 
 /* Reads the prices of the states' rows, and the program; factorises P. Returns whether
@@ -975,12 +980,12 @@ static void solve(gpmpc_program *work, const real *prices, const gpmpc_solution 
         fill(solution->x, 0, N);
         return;
     }
-    (void)solve_opened(work, guess, solution);
+    solve_opened(work, guess, solution);
     if (is_certain(work, solution))
         return;
     iterations = solution->iterations;
     if (read_bounds(work))
-        (void)solve_opened(work, solution, solution);
+        solve_opened(work, solution, solution);
     solution->iterations += iterations;
     if (!is_certain(work, solution) && solution->status != GPMPC_ITERATION_LIMIT)
         solution->status = GPMPC_NUMERICAL_TROUBLE;

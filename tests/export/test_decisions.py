@@ -24,7 +24,7 @@ from gpmpc.mpc import (
     Tracking,
 )
 from gpmpc.propagation import Linearization
-from gpmpc.simulation import closed_loop
+from gpmpc.simulation import ModelLoop, closed_loop
 from gpmpc.status import Status
 from tests.mpc.small_models import pendulum_posterior
 
@@ -218,11 +218,20 @@ def test_float_differs_by_little():
 def test_flies_in_closed_loop():
     controller = gpmpc(Problem(WEIGHTS, TORQUES))
     compiled = CompiledController(controller, compiler=COMPILER)
-    from gpmpc.simulation import ModelLoop
-
     loop = ModelLoop(GP, Linearization(), time_step=0.2)
     flights = [
         closed_loop(loop, flown, [0.5, 0.0], Gaussian.certain(np.zeros(2)), 20)
         for flown in (controller, compiled)
     ]
     assert np.abs(flights[0].inputs - flights[1].inputs).max() < 1e-9
+
+
+def test_a_failed_step_knows_no_violation():
+    compiled = CompiledController(tube("exact"), compiler=COMPILER)
+    origin = Reference(np.zeros(2))
+    decision = compiled.control(Gaussian.certain([0.1, 0.0]), origin)
+    assert decision.violation >= 0.0
+    lost = Gaussian.certain(np.full(2, np.nan))
+    failed = compiled.control(lost, origin, decision)
+    assert failed.status is Status.INVALID_MEASUREMENT
+    assert np.isnan(failed.violation)

@@ -1,5 +1,5 @@
-/* Replays a recorded flight: what was measured goes to the controller, and its inputs are
-   held beside those that Python decided on.
+/* Replays a recorded flight: what was measured goes to the controller, and its inputs
+   are held beside those that Python decided on.
 
      ./replay replay.txt
 
