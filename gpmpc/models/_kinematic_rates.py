@@ -70,24 +70,24 @@ def kinematic_residual(
     noise = torch.zeros(n, dtype=states.dtype)
     learned = list(range(n))
     for rate, position in _from_the_highest(rates):
-        moved = change[:, position]
+        unexplained = change[:, position]
         if nominal is None:
-            moved = moved - time_step * states[:, rate]
-        by_rate = time_step * change[:, rate]
-        share = _share(moved, by_rate, basis)
-        rest = moved - share * by_rate
-        A[position] += time_step * A[rate] * share
-        A[position, rate] += time_step * (1 - share)
-        moved_by_outputs = share * time_step * effect[rate]
-        if _learnable_part(rest, basis) > _LEARNABLE:
-            effect[position] += moved_by_outputs
+            unexplained = unexplained - time_step * states[:, rate]
+        rate_change = time_step * change[:, rate]
+        c = _integration_coefficient(unexplained, rate_change, basis)
+        remainder = unexplained - c * rate_change
+        A[position] += time_step * A[rate] * c
+        A[position, rate] += time_step * (1 - c)
+        effect_by_rate = c * time_step * effect[rate]
+        if _learnable_part(remainder, basis) > _LEARNABLE:
+            effect[position] += effect_by_rate
             continue
-        effect[position] = moved_by_outputs
-        noise[position] = rest.square().mean()
+        effect[position] = effect_by_rate
+        noise[position] = remainder.square().mean()
         learned.remove(position)
     if nominal is None:
-        known = Affine.identity(n, inputs.shape[1])
-        nominal = Affine(A=A, B=known.B, c=known.c)
+        identity = Affine.identity(n, inputs.shape[1])
+        nominal = Affine(A=A, B=identity.B, c=identity.c)
     return KinematicResidual(nominal, effect[:, learned], noise)
 
 
@@ -95,7 +95,7 @@ def _from_the_highest(rates: Mapping[int, int]) -> list[tuple[int, int]]:
     """Returns pairs (rate, position), those of accelerations before velocities."""
 
     def derivatives_above(position: int) -> int:
-        above = [rate for rate, moved in rates.items() if moved == position]
+        above = [rate for rate, integral in rates.items() if integral == position]
         return 1 + derivatives_above(above[0]) if above else 0
 
     return sorted(rates.items(), key=lambda pair: derivatives_above(pair[1]))
@@ -121,34 +121,38 @@ def _basis(features: Tensor) -> Tensor:
     return U[:, sizes > 1e-9 * sizes[0]]
 
 
-def _share(moved: Tensor, by_rate: Tensor, basis: Tensor) -> float:
-    """Estimates c of ``moved`` = c ``by_rate``, both (N,), in [0, 1].
+def _integration_coefficient(
+    position_change: Tensor, rate_change: Tensor, basis: Tensor
+) -> float:
+    """Estimates c of ``position_change`` = c ``rate_change``, both (N,), in [0, 1].
 
-    It is 1/2 unless the data contradict.
+    The instruments of the least squares are the basis (N, t). c is 1/2 unless the data
+    contradict.
     """
-    explained = basis @ (basis.mT @ by_rate)
-    energy = float(explained @ by_rate)
+    explained = basis @ (basis.mT @ rate_change)
+    energy = float(explained @ rate_change)
     if energy <= 0.0:
         return _EVEN
-    share = float(explained @ moved) / energy
-    rest = moved - share * by_rate
-    error = (float(rest.square().mean()) / energy) ** 0.5
-    if abs(share - _EVEN) <= _SIGNIFICANT * error:
+    c = float(explained @ position_change) / energy
+    remainder = position_change - c * rate_change
+    standard_error = (float(remainder.square().mean()) / energy) ** 0.5
+    if abs(c - _EVEN) <= _SIGNIFICANT * standard_error:
         return _EVEN
-    return min(max(share, 0.0), 1.0)
+    return min(max(c, 0.0), 1.0)
 
 
-def _learnable_part(rest: Tensor, basis: Tensor) -> float:
-    """Returns which part of the mean square of ``rest`` (N,) the features explain.
+def _learnable_part(remainder: Tensor, basis: Tensor) -> float:
+    """Returns which part of the mean square of a column (N,) the features explain.
 
     It is corrected for the number of terms, which explain some of any noise.
     """
     size, terms = basis.shape
-    whole = float(rest.square().sum())
+    whole = float(remainder.square().sum())
     if terms >= size or whole == 0.0:
         return 0.0
-    unexplained = float((rest - basis @ (basis.mT @ rest)).square().sum())
-    return 1.0 - unexplained / (size - terms) / (whole / size)
+    unexplained = remainder - basis @ (basis.mT @ remainder)
+    unexplained_variance = float(unexplained.square().sum()) / (size - terms)
+    return 1.0 - unexplained_variance / (whole / size)
 
 
 def positions_by_rate(

@@ -142,19 +142,19 @@ def _train_on_system(
             nominal=nominal,
             seed=seed,
         )
-    known = _kinematics_of(system, transitions, nominal)
+    kinematic = _kinematics_of(system, transitions, nominal)
     training = train_residual(
         trainer=trainer,
         transitions=transitions,
         angles=system.angle_indices,
-        nominal=known.nominal,
+        nominal=kinematic.nominal,
         seed=seed,
-        B=known.B,
+        B=kinematic.B,
     )
-    if not known.noise.any():
+    if not kinematic.noise.any():
         return training
     model = cast(ResidualModel, training.posterior)
-    noise = model.noise_covariance + torch.diag(known.noise)
+    noise = model.noise_covariance + torch.diag(kinematic.noise)
     return replace(training, posterior=cast(Any, replace(model, noise=noise)))
 
 

@@ -241,5 +241,5 @@ def _tangent(car: KinematicBicycle, steering: Any) -> Any:
 def _tyre_force(slip: Any, stiffness: Any, grip: Any) -> Any:
     """Returns the force of tyres over the mass [m/s2]."""
     linear = stiffness * slip
-    share = linear / grip
-    return linear / sqrt(1 + share * share)
+    saturation = linear / grip
+    return linear / sqrt(1 + saturation * saturation)
