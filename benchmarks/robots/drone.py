@@ -31,7 +31,7 @@ spline = CubicSpline([0, 1.5, 3, 4.5, 6, 9], gates, bc_type="clamped")
 t = 0.05 * np.arange(160)
 reference = np.hstack([spline(t), spline(t, 1), np.zeros((160, 2))])
 plant = System(
-    Drone(), time_step=0.05, start=reference[0], rates={"vx": "x", "vy": "y", "vz": "z"},
+    Drone(), 0.05, start=reference[0], rates={"vx": "x", "vy": "y", "vz": "z"},
     input_lower=[4, -0.6, -0.6], input_upper=[16, 0.6, 0.6], initial_input=[9.81, 0, 0],
     region=[[0, -2, 0, -3, -3, -2, -0.6, -0.6], [8, 2, 3, 3, 3, 2, 0.6, 0.6]],
 )  # fmt: skip

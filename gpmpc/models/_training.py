@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from gpmpc._calls import explains_arguments
-from gpmpc.exceptions import SettingError, ShapeError, check_choice
+from gpmpc.exceptions import SettingError, ShapeError, check_choice, check_kind
 from gpmpc.gp import Trainer, Training, Transitions, standardize
 from gpmpc.gp._transitions import check_transitions
 from gpmpc.models._features import Features
@@ -85,21 +85,13 @@ def train(
     if system is None:
         trainer = trainer or Trainer(**settings)
         return trainer(transitions, seed=seed)
-    _check_system(system)
+    example = "a System, such as System(Pendulum(), time_step=0.05)"
+    check_kind("system", system, System, example)
     transitions = _named(transitions, system)
     if trainer is None:
         defaults = {"predicts": "difference", "scaling": standardize}
         trainer = Trainer(**(defaults | settings))
     return _train_on_system(transitions, system, trainer, kinematics, seed)
-
-
-def _check_system(system: Any) -> None:
-    if not isinstance(system, System):
-        raise SettingError(
-            "system",
-            "must be a System, such as System(Pendulum(), time_step=0.05); "
-            f"got {type(system).__name__}",
-        )
 
 
 def _named(transitions: Transitions, system: System) -> Transitions:
