@@ -27,7 +27,8 @@ How ``learn`` makes a model of a log:
 4. parameters    ``_fitting`` fits nominal models on rollouts.
 5. residuals     ``_output_gps`` trains GPs on what a nominal model leaves.
 6. choice        ``_search`` compares structures on held-out rows, beside the baselines
-                 of ``_baselines``; ``_comparison`` says by how much one wins.
+                 of ``_baselines``; ``_rollout_corrections`` corrects rollouts by the
+                 past; ``_comparison`` says by how much one wins.
 7. noise         ``_noise`` finds the noise behind the errors of held-out rollouts.
 
 ``_learning`` holds these steps in their order. ``_judging`` judges what was learned

@@ -12,7 +12,7 @@ over that of the best baseline; where it is behind, that counts twice.
 """
 
 from collections.abc import Iterable, Mapping, MutableMapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +27,11 @@ from gpmpc.logs._folds import Fold
 from gpmpc.logs._log import Log
 from gpmpc.logs._noise import fit_noise
 from gpmpc.logs._output_gps import train_output_gp
+from gpmpc.logs._rollout_corrections import (
+    Rollouts,
+    choose_penalties,
+    fit_correction,
+)
 from gpmpc.logs._smoothing import smooth
 from gpmpc.logs._structures import (
     MOST_PAST,
@@ -41,7 +46,6 @@ from gpmpc.models._grouped import GroupedNominal
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel, OutputGP
 from gpmpc.models._parametric import AffineNominal
-from gpmpc.models._windows import Windows
 
 PAST_ROWS = MOST_PAST  # of the windows that structures are compared on
 _AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
@@ -52,13 +56,10 @@ _CLOSE = 0.02  # of the best score: where the second one goes on as well
 _FEW = 10_000  # rows of a log, up to which half of them make a worse model
 _WINDOWS = 200  # of a fold, that structures are compared on
 _CORRECTED_WINDOWS = 1200  # of a fold, that a correction is fitted to
-_PARTS = 6  # of the held-out runs, each corrected by what the others say
 _LARGEST = 1e6  # state of a rollout that a correction is fitted to
 _CORRECTED = 2  # structures upon which a correction is tried
 _FILTERED_WINDOWS = 4000  # that the filter of starts is fitted to
 _FILTER_PENALTY = 1e-4  # of squared coefficients of the filter of starts, per row
-_KNOTS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # steps of a correction
-_PENALTIES = (0.001, 0.01, 0.1, 1.0, 10.0, np.inf)  # tried of a correction
 _EXACT = 1e-4  # of a constant state's error: what is smaller counts as exact
 _NOTHING = 1e-9  # of the outputs: a residual that is none
 _LOSS = 2.0  # weight of being behind a baseline
@@ -70,17 +71,6 @@ class _TrainingData(NamedTuple):
 
     log: Log  # smoothed, where its rows are noisy
     start_filter: StartFilter | None  # None where they are not
-
-
-@dataclass(frozen=True)
-class _Rollouts:
-    """Windows, and what a model predicts of them."""
-
-    windows: Windows
-    predicted: Array  # (W, steps, n)
-
-    def __getitem__(self, rows: Any) -> "_Rollouts":
-        return _Rollouts(self.windows[rows], self.predicted[rows])
 
 
 class Search:
@@ -436,49 +426,21 @@ class Search:
             by_fold = self._held_out_rollouts(structure)
             if not all(len(rollouts.windows) for rollouts in by_fold):
                 return
-            rollouts = _concatenated(by_fold)
-            self._memory[key] = self._choose_penalties(structure, rollouts)
+            chosen = choose_penalties(
+                kinematics=structure.model.kinematics,
+                rollouts=Rollouts.concatenate(by_fold),
+                judged_steps=self.judged_steps,
+            )
+            errors = self._errors[structure.key] * chosen.ratios
+            self._memory[key] = {
+                "penalties": chosen.penalties.tolist(),
+                "errors": errors.tolist(),
+            }
         penalties = [tuple(map(float, row)) for row in self._memory[key]["penalties"]]
         errors = np.array(self._memory[key]["errors"])
         self._enter(replace(structure, penalties=tuple(penalties)), errors)
 
-    def _choose_penalties(
-        self, structure: Structure, rollouts: "_Rollouts"
-    ) -> dict[str, list[list[float]]]:
-        """Returns the best penalties (judged steps, groups) of a correction.
-
-        The errors that it has with them come along: each run, or block of one, is
-        corrected by what the others say. Windows of the same run are no test of a
-        correction, which follows what is common to them.
-
-        Args:
-            structure: That is corrected.
-            rollouts: Of all that was held out.
-        """
-        without = self._log.space.distances(
-            rollouts.windows.errors(rollouts.predicted, self.judged_steps)
-        )
-        alternatives = [np.full(self._scale.shape, one) for one in _PENALTIES]
-        distances = np.empty((len(_PENALTIES), *without.shape))
-        for is_own in _parts_of_whole_runs(rollouts.windows):
-            corrections = self._corrections(
-                rollouts[~is_own], self.judged_steps, alternatives
-            )
-            own = rollouts[is_own]
-            for i, correction in enumerate(corrections):
-                corrected = correction(own.windows, own.predicted)
-                distances[i, is_own] = self._log.space.distances(
-                    own.windows.errors(corrected, self.judged_steps)
-                )
-        ratios = distances.mean(axis=1) / without.mean(axis=0)
-        best = np.argmin(ratios, axis=0)
-        errors = self._errors[structure.key] * np.min(ratios, axis=0)
-        return {
-            "penalties": np.array(_PENALTIES)[best].tolist(),
-            "errors": errors.tolist(),
-        }
-
-    def _held_out_rollouts(self, structure: Structure) -> list["_Rollouts"]:
+    def _held_out_rollouts(self, structure: Structure) -> list[Rollouts]:
         """Returns rollouts of held-out rows, by the models of the other fold."""
         rollouts = []
         for model, fold in zip(self._models(structure), self._folds, strict=True):
@@ -488,44 +450,17 @@ class Search:
             with np.errstate(over="ignore", invalid="ignore"):
                 predicted = model.rollout(windows)
             is_finite = np.abs(predicted).max(axis=(1, 2)) < _LARGEST
-            rollouts.append(_Rollouts(windows, predicted)[is_finite])
+            rollouts.append(Rollouts(windows, predicted)[is_finite])
         return rollouts
 
-    def _corrections(
-        self,
-        rollouts: "_Rollouts",
-        knots: Sequence[int],
-        alternatives: Sequence[Array],
-    ) -> list[Correction]:
-        """Fits corrections of rollouts, with each of some penalties.
-
-        Args:
-            rollouts: That are corrected.
-            knots: Steps of the corrections.
-            alternatives: Penalties (judged steps, groups).
-        """
-        judged = np.log(self.judged_steps)
-        nearest = [np.abs(judged - np.log(knot)).argmin() for knot in knots]
-        entries = [group.error_dim for group in rollouts.windows.space.groups]
-        return Correction.fit_each(
-            kinematics=self._bases[0].model.kinematics,
-            windows=rollouts.windows,
-            predicted=rollouts.predicted,
-            steps=knots,
-            alternatives=[
-                np.repeat(penalties[nearest], entries, axis=1)
-                for penalties in alternatives
-            ],
+    def _correction(self, structure: Structure, rollouts: Rollouts) -> Correction:
+        """Fits the correction of a structure to rollouts."""
+        return fit_correction(
+            kinematics=structure.model.kinematics,
+            rollouts=rollouts,
+            judged_steps=self.judged_steps,
+            penalties=np.array(structure.penalties),
         )
-
-    def _chosen_correction(
-        self, structure: Structure, rollouts: "_Rollouts"
-    ) -> Correction:
-        """Fits the correction of a structure, at all of its steps."""
-        steps = {step for step in _KNOTS if step < self._steps} | {self._steps}
-        penalties = np.array(structure.penalties)
-        (correction,) = self._corrections(rollouts, sorted(steps), [penalties])
-        return correction
 
     # what all of them need
 
@@ -552,7 +487,7 @@ class Search:
         # What one fold holds out, the model of the other was fitted to.
         first, second = self._held_out_rollouts(replace(structure, penalties=()))
         return [
-            replace(model, correction=self._chosen_correction(structure, rollouts))
+            replace(model, correction=self._correction(structure, rollouts))
             for model, rollouts in zip(models, (second, first), strict=True)
         ]
 
@@ -660,7 +595,7 @@ class Search:
         held_out = [fold.held_out for fold, _ in folds]
         return fit_noise(models, held_out, self._steps)
 
-    def _quarters(self) -> list[tuple[Fold, "_Rollouts | None"]]:
+    def _quarters(self) -> list[tuple[Fold, Rollouts | None]]:
         """Halves what each fold holds out, every other run or block of it.
 
         With them come the rollouts that a correction may be fitted to.
@@ -668,7 +603,7 @@ class Search:
         Raises:
             DataError: One would be without windows.
         """
-        rollouts: list[_Rollouts] = []
+        rollouts: list[Rollouts] = []
         if self.best.penalties:
             rollouts = self._held_out_rollouts(replace(self.best, penalties=()))
         quarters = []
@@ -686,7 +621,7 @@ class Search:
                 if rollouts:
                     own = rollouts[i]
                     is_other = own.windows.runs % 2 != first
-                    others = _concatenated([own[is_other], rollouts[1 - i]])
+                    others = Rollouts.concatenate([own[is_other], rollouts[1 - i]])
                 quarters.append((quarter, others))
         return quarters
 
@@ -695,10 +630,10 @@ class Search:
         rollouts = None
         if self.best.penalties:
             uncorrected = replace(self.best, penalties=())
-            rollouts = _concatenated(self._held_out_rollouts(uncorrected))
+            rollouts = Rollouts.concatenate(self._held_out_rollouts(uncorrected))
         return self._fit_best_to(self._log, rollouts)
 
-    def _fit_best_to(self, log: Log, rollouts: "_Rollouts | None") -> NominalFit:
+    def _fit_best_to(self, log: Log, rollouts: Rollouts | None) -> NominalFit:
         """Fits the best structure to a log.
 
         Args:
@@ -713,8 +648,7 @@ class Search:
         gps = tuple(self._train(gp, fit.model, training.log) for gp in best.gps)
         model = replace(fit.model, gps=gps, start_filter=training.start_filter)
         if rollouts is not None:
-            correction = self._chosen_correction(best, rollouts)
-            model = replace(model, correction=correction)
+            model = replace(model, correction=self._correction(best, rollouts))
         return replace(fit, model=model)
 
     def _fit_nominal_to(self, log: Log, structure: Structure) -> NominalFit:
@@ -733,37 +667,6 @@ class Search:
             for fit in fits
         ]
         return NominalFit(model, np.concatenate(errors))
-
-
-def _parts_of_whole_runs(windows: Windows) -> list[np.ndarray]:
-    """Deals runs to parts; returns which windows are of each (W,)."""
-    runs = np.unique(windows.runs)
-    parts = np.array_split(runs, min(_PARTS, len(runs)))
-    return [np.isin(windows.runs, part) for part in parts]
-
-
-def _concatenated(parts: Sequence[_Rollouts]) -> _Rollouts:
-    """Concatenates rollouts of different runs, those of the first part first.
-
-    The runs are numbered anew.
-    """
-    windows = [part.windows for part in parts]
-    runs = []
-    first = 0
-    for one in windows:
-        numbers, numbered = np.unique(one.runs, return_inverse=True)
-        runs.append(first + numbered)
-        first += len(numbers)
-    joined = replace(
-        windows[0],
-        stride=min(one.stride for one in windows),
-        states=np.concatenate([one.states for one in windows]),
-        inputs=np.concatenate([one.inputs for one in windows]),
-        context=np.concatenate([one.context for one in windows]),
-        runs=np.concatenate(runs),
-        times=np.concatenate([one.times for one in windows]),
-    )
-    return _Rollouts(joined, np.concatenate([part.predicted for part in parts]))
 
 
 def combine_models(

@@ -13,6 +13,7 @@ from gpmpc.logs._comparison import compare
 from gpmpc.logs._control_fitness import judge_for_control
 from gpmpc.logs._folds import split_folds
 from gpmpc.logs._log import LogRun
+from gpmpc.logs._rollout_corrections import Rollouts, choose_penalties
 from gpmpc.logs._smoothing import smooth
 from gpmpc.models import LogModel
 from gpmpc.models._correction import Correction
@@ -168,6 +169,25 @@ def test_a_correction_upon_a_still_state_is_a_regression():
     ends = correction(windows, still) - still
     expected = ends[:, 0] + (ends[:, 9] - ends[:, 0]) * 4 / 9
     np.testing.assert_allclose(between, expected, atol=1e-12)
+
+
+def test_what_runs_have_each_for_themselves_is_not_corrected():
+    rng = np.random.default_rng(1)
+    levels = rng.normal(size=(6, 2))
+    states = [level + 0.01 * rng.normal(size=(100, 2)) for level in levels]
+    log = log_of(states, [np.full((100, 1), level) for level in rng.normal(size=6)])
+    windows = log.windows(10, past=20)
+    measured = windows.states[:, 21:]
+
+    def penalties(errors):
+        rollouts = Rollouts(windows, measured + errors)
+        return choose_penalties(Increments(log.space), rollouts, (1, 10))
+
+    own = penalties(rng.normal(size=(6, 1, 2))[windows.runs])
+    assert (own.ratios > 0.8).all()
+    common = penalties(np.ones((len(windows), 1, 2)))
+    assert np.isfinite(common.penalties).all()
+    assert (common.ratios < 0.1).all()
 
 
 def test_intervals_of_a_comparison_hold():
