@@ -200,14 +200,16 @@ def _unstable_loops(
     inputs = windows.inputs[:, 0]
     features = model.kinematics.features(states, inputs, windows.context[:, 0])
     rows = choose_rows(features, _STATES)
-    points = states[rows], inputs[rows], windows.context[rows, 0]
+    context = windows.context[rows, 0]
     spread = model.kinematics.space.difference(states, states[:1]).std(axis=0)
     Q = np.diag(1 / np.maximum(spread, 1e-9) ** 2)
     R = np.diag(1 / np.maximum(inputs.std(axis=0), 1e-9) ** 2)
-    A, B = _linearize(model, *points, log.time_step)
+    A, B = _linearize(model, states[rows], inputs[rows], context, log.time_step)
     sentences = []
     for name, rival in rivals.items():
-        rival_A, rival_B = _linearize(rival, *points, log.time_step)
+        rival_A, rival_B = _linearize(
+            rival, states[rows], inputs[rows], context, log.time_step
+        )
         tried = 0
         unstable = 0
         for k in range(len(rows)):
