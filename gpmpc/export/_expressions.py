@@ -11,10 +11,6 @@ from collections.abc import Callable, Sequence
 from gpmpc._kernels import tape as tapes
 from gpmpc.export._text import Numbers
 
-#: operations that only derivatives have: 1 where a <= b, and where a < b, else 0
-_AT_MOST = 100
-_BELOW = 101
-
 _UNARY: dict[int, str] = {
     tapes.ASSIGN: "{a}",
     tapes.NEG: "-{a}",
@@ -30,6 +26,20 @@ _UNARY: dict[int, str] = {
     tapes.ATAN: "ATAN({a})",
     tapes.TANH: "TANH({a})",
     tapes.FABS: "FABS({a})",
+    tapes.ASIN: "ASIN({a})",
+    tapes.ACOS: "ACOS({a})",
+    tapes.SINH: "SINH({a})",
+    tapes.COSH: "COSH({a})",
+    tapes.ASINH: "ASINH({a})",
+    tapes.ACOSH: "ACOSH({a})",
+    tapes.ATANH: "ATANH({a})",
+    tapes.EXPM1: "EXPM1({a})",
+    tapes.LOG1P: "LOG1P({a})",
+    tapes.ERF: "ERF({a})",
+    tapes.FLOOR: "FLOOR({a})",
+    tapes.CEIL: "CEIL({a})",
+    tapes.SIGN: "(real)(({a} > 0) - ({a} < 0))",
+    tapes.NOT: "(real)({a} == 0)",
 }
 _BINARY: dict[int, str] = {
     tapes.ADD: "{a} + {b}",
@@ -41,8 +51,16 @@ _BINARY: dict[int, str] = {
     tapes.FMIN: "smaller({a}, {b})",
     tapes.FMAX: "larger({a}, {b})",
     tapes.ATAN2: "ATAN2({a}, {b})",
-    _AT_MOST: "(real)({a} <= {b})",
-    _BELOW: "(real)({a} < {b})",
+    tapes.HYPOT: "HYPOT({a}, {b})",
+    tapes.FMOD: "FMOD({a}, {b})",
+    tapes.COPYSIGN: "COPYSIGN({a}, {b})",
+    tapes.IF_ELSE_ZERO: "{a} != 0 ? {b} : 0",
+    tapes.LT: "(real)({a} < {b})",
+    tapes.LE: "(real)({a} <= {b})",
+    tapes.EQ: "(real)({a} == {b})",
+    tapes.NE: "(real)({a} != {b})",
+    tapes.AND: "(real)({a} != 0 && {b} != 0)",
+    tapes.OR: "(real)({a} != 0 || {b} != 0)",
 }
 _FUNCTIONS: dict[int, Callable[..., float]] = {
     tapes.ADD: lambda a, b: a + b,
@@ -134,16 +152,19 @@ class Graph:
         if operation == tapes.CONST:
             return {}
         a = int(a)
-        partials = [(a, self._by_first)]
-        if operation in _BINARY:
-            partials.append((b, self._by_second))
+        if operation == tapes.IF_ELSE_ZERO:
+            slopes = self._derivatives.get(b, {}).items()
+            return {c: self.binary(operation, a, slope) for c, slope in slopes}
+        if operation in _UNARY:
+            slopes_by_operand = [(a, self._by_operand(node, operation, a))]
+        else:
+            slopes_by_operand = [
+                (a, self._by_first(node, operation, a, b)),
+                (b, self._by_second(node, operation, a, b)),
+            ]
         derivatives: Derivatives = {}
-        for operand, partial in partials:
-            inner = self._derivatives.get(operand, {})
-            if not inner:
-                continue
-            slope = partial(node, operation, a, b)
-            for column, derivative in inner.items():
+        for operand, slope in slopes_by_operand:
+            for column, derivative in self._derivatives.get(operand, {}).items():
                 term = self.binary(tapes.MUL, slope, derivative)
                 if column in derivatives:
                     term = self.binary(tapes.ADD, derivatives[column], term)
@@ -151,16 +172,13 @@ class Graph:
         zero = self.constant(0.0)
         return {column: d for column, d in derivatives.items() if d != zero}
 
-    def _by_first(self, node: int, operation: int, a: int, b: int) -> int:
-        """Returns the derivative of an operation by its first operand."""
+    def _by_operand(self, node: int, operation: int, a: int) -> int:
+        """Returns the derivative of an operation on one operand; of steps it is 0."""
         one = self.constant(1.0)
-        square = self.unary(tapes.SQ, a)
-        if operation in (tapes.ADD, tapes.SUB):
-            return one
-        if operation == tapes.MUL:
-            return b
-        if operation == tapes.DIV:
-            return self.binary(tapes.DIV, one, b)
+        if operation in (tapes.SIN, tapes.COS):
+            cosine = self.unary(tapes.COS, a)
+            minus_sine = self.unary(tapes.NEG, self.unary(tapes.SIN, a))
+            return cosine if operation == tapes.SIN else minus_sine
         if operation == tapes.NEG:
             return self.constant(-1.0)
         if operation == tapes.SQ:
@@ -169,44 +187,79 @@ class Graph:
             return self.constant(2.0)
         if operation == tapes.INV:
             return self.unary(tapes.NEG, self.binary(tapes.MUL, node, node))
-        if operation == tapes.EXP:
-            return node
-        if operation == tapes.LOG:
-            return self.unary(tapes.INV, a)
         if operation == tapes.SQRT:
             return self.binary(tapes.DIV, self.constant(0.5), node)
-        if operation == tapes.SIN:
-            return self.unary(tapes.COS, a)
-        if operation == tapes.COS:
-            return self.unary(tapes.NEG, self.unary(tapes.SIN, a))
+        if operation == tapes.FABS:
+            return self.unary(tapes.SIGN, a)
+        if operation in (tapes.EXP, tapes.EXPM1):
+            return self.unary(tapes.EXP, a)
+        if operation == tapes.LOG:
+            return self.unary(tapes.INV, a)
+        if operation == tapes.LOG1P:
+            return self.unary(tapes.INV, self.binary(tapes.ADD, one, a))
+        if operation == tapes.ERF:
+            square = self.unary(tapes.SQ, a)
+            bell = self.unary(tapes.EXP, self.unary(tapes.NEG, square))
+            factor = self.constant(2.0 / math.sqrt(math.pi))
+            return self.binary(tapes.MUL, factor, bell)
+        return self._by_angle(node, operation, a)
+
+    def _by_angle(self, node: int, operation: int, a: int) -> int:
+        """The same for tangents, inverse and hyperbolic functions."""
+        one = self.constant(1.0)
+        square = self.unary(tapes.SQ, a)
         if operation == tapes.TAN:
             return self.binary(tapes.ADD, one, self.binary(tapes.MUL, node, node))
-        if operation == tapes.ATAN:
-            return self.unary(tapes.INV, self.binary(tapes.ADD, one, square))
         if operation == tapes.TANH:
             return self.binary(tapes.SUB, one, self.binary(tapes.MUL, node, node))
+        if operation == tapes.SINH:
+            return self.unary(tapes.COSH, a)
+        if operation == tapes.COSH:
+            return self.unary(tapes.SINH, a)
+        if operation == tapes.ATAN:
+            return self.unary(tapes.INV, self.binary(tapes.ADD, one, square))
+        if operation == tapes.ATANH:
+            return self.unary(tapes.INV, self.binary(tapes.SUB, one, square))
+        radicands = {
+            tapes.ASIN: self.binary(tapes.SUB, one, square),
+            tapes.ACOS: self.binary(tapes.SUB, one, square),
+            tapes.ASINH: self.binary(tapes.ADD, one, square),
+            tapes.ACOSH: self.binary(tapes.SUB, square, one),
+        }
+        if operation not in radicands:
+            return self.constant(0.0)
+        root = self.unary(tapes.SQRT, radicands[operation])
+        slope = self.unary(tapes.INV, root)
+        return self.unary(tapes.NEG, slope) if operation == tapes.ACOS else slope
+
+    def _by_first(self, node: int, operation: int, a: int, b: int) -> int:
+        """Returns the derivative by the first of two operands; of comparisons 0."""
+        one = self.constant(1.0)
+        if operation in (tapes.ADD, tapes.SUB, tapes.FMOD):
+            return one
+        if operation == tapes.MUL:
+            return b
+        if operation == tapes.DIV:
+            return self.binary(tapes.DIV, one, b)
         if operation == tapes.ATAN2:
-            squares = self.binary(tapes.ADD, square, self.unary(tapes.SQ, b))
-            return self.binary(tapes.DIV, b, squares)
-        if operation == tapes.FABS:
-            zero = self.constant(0.0)
-            return self.binary(
-                tapes.SUB,
-                self.binary(_BELOW, zero, a),
-                self.binary(_BELOW, a, zero),
-            )
+            return self.binary(tapes.DIV, b, self._sum_of_squares(a, b))
+        if operation == tapes.HYPOT:
+            return self.binary(tapes.DIV, a, node)
+        if operation == tapes.COPYSIGN:  # 1 where the sign stayed, else -1
+            stayed = self.binary(tapes.EQ, node, a)
+            return self.binary(tapes.SUB, self.unary(tapes.TWICE, stayed), one)
         if operation == tapes.FMIN:
-            return self.binary(_AT_MOST, a, b)
+            return self.binary(tapes.LE, a, b)
         if operation == tapes.FMAX:
-            return self.binary(_AT_MOST, b, a)
+            return self.binary(tapes.LE, b, a)
         if operation in (tapes.POW, tapes.CONSTPOW):
             lower = self.binary(tapes.SUB, b, one)
             power = self.binary(operation, a, lower)
             return self.binary(tapes.MUL, b, power)
-        return self.constant(0.0)  # of a comparison
+        return self.constant(0.0)
 
     def _by_second(self, node: int, operation: int, a: int, b: int) -> int:
-        """Returns the derivative of an operation by its second operand."""
+        """Returns the derivative by the second of two operands; of comparisons 0."""
         one = self.constant(1.0)
         if operation == tapes.ADD:
             return one
@@ -217,15 +270,25 @@ class Graph:
         if operation == tapes.DIV:
             return self.unary(tapes.NEG, self.binary(tapes.DIV, node, b))
         if operation == tapes.ATAN2:
-            squares = self.binary(
-                tapes.ADD, self.unary(tapes.SQ, a), self.unary(tapes.SQ, b)
-            )
-            return self.unary(tapes.NEG, self.binary(tapes.DIV, a, squares))
+            slope = self.binary(tapes.DIV, a, self._sum_of_squares(a, b))
+            return self.unary(tapes.NEG, slope)
+        if operation == tapes.HYPOT:
+            return self.binary(tapes.DIV, b, node)
         if operation in (tapes.FMIN, tapes.FMAX):
             return self.binary(tapes.SUB, one, self._by_first(node, operation, a, b))
-        if operation == tapes.POW:
-            return self.binary(tapes.MUL, self.unary(tapes.LOG, a), node)
+        if operation == tapes.FMOD:  # minus the whole quotient
+            multiple = self.binary(tapes.SUB, node, a)
+            return self.binary(tapes.DIV, multiple, b)
+        if operation == tapes.POW:  # zero where there is no logarithm
+            slope = self.binary(tapes.MUL, self.unary(tapes.LOG, a), node)
+            is_positive = self.binary(tapes.LT, self.constant(0.0), a)
+            return self.binary(tapes.IF_ELSE_ZERO, is_positive, slope)
         return self.constant(0.0)
+
+    def _sum_of_squares(self, a: int, b: int) -> int:
+        """Returns the node of a^2 + b^2."""
+        squares = [self.unary(tapes.SQ, operand) for operand in (a, b)]
+        return self.binary(tapes.ADD, *squares)
 
     def statements(
         self,

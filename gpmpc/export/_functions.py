@@ -5,7 +5,7 @@ from typing import Any
 
 from gpmpc.exceptions import SettingError
 from gpmpc.export._expressions import expansion_lines, graph_of_tape
-from gpmpc.export._text import Numbers
+from gpmpc.export._text import Numbers, function
 from gpmpc.models import CasadiFunction
 from gpmpc.mpc import GPMPC, Inequality
 from gpmpc.mpc._cost import by_stage
@@ -55,7 +55,8 @@ class FunctionWriter:
                     f"    for (i = 0; i < {count}; i++) {{",
                     f"        h[{rows} + i] = value[i];",
                     f"        copy(jacobian + i * (n + m), E + ({rows} + i) * n, n);",
-                    f"        copy(jacobian + i * (n + m) + n, D + ({rows} + i) * m, m);",
+                    "        copy(jacobian + i * (n + m) + n,",
+                    f"             D + ({rows} + i) * m, m);",
                     "    }",
                     "}",
                 ]
@@ -95,26 +96,32 @@ class FunctionWriter:
         )
         self._function(signature, body, "squares of y(x, u, p) - c along the plan")
 
-    def _write_function(self, key: str, function: Any, count: int, name: str) -> None:
+    def _write_function(self, key: str, smooth: Any, count: int, name: str) -> None:
         """Writes a function of (x, u, p) with its derivatives by x and u."""
-        if not hasattr(function, "n_in"):
+        if not hasattr(smooth, "n_in"):
             rule = "an exported function is one of CasADi"
-            raise SettingError(key, f"{rule}; got {type(function).__name__}")
-        wrapped = CasadiFunction(function)
+            raise SettingError(key, f"{rule}; got {type(smooth).__name__}")
+        wrapped = CasadiFunction(smooth)
         if wrapped.tape is None:
             rule = "an exported function is made of elementary operations"
-            raise SettingError(key, f"{rule}; got {function}")
+            raise SettingError(key, f"{rule}; got {smooth}")
         inputs: list[str] = []
         columns: list[int] = []
-        for argument, size in enumerate(wrapped.sizes):
-            inputs += [f"{'xup'[argument]}[{i}]" for i in range(size)]
-            offset = (0, self._n, self._n + self._m)[argument]
-            columns += [offset + i for i in range(size)]
+        first_columns = (0, self._n, self._n + self._m)
+        arguments = zip("xup", first_columns, wrapped.sizes, strict=False)
+        for argument, first, size in arguments:
+            inputs += [f"{argument}[{i}]" for i in range(size)]
+            columns += range(first, first + size)
         if len(wrapped.sizes) > 2:
             self.parameters = max(self.parameters, wrapped.sizes[2])
         graph, value = graph_of_tape(wrapped.tape)
         lines = expansion_lines(
-            graph, value, inputs, self._numbers, columns, self._n + self._m
+            graph,
+            value,
+            inputs,
+            self._numbers,
+            columns=columns,
+            width=self._n + self._m,
         )
         signature = (
             f"static void {name}(const real *x, const real *u, const real *p,\n"
@@ -124,10 +131,9 @@ class FunctionWriter:
         size = count * (self._n + self._m)
         self._function(signature, [*unused, f"fill(jacobian, 0, {size});", *lines], key)
 
-    def _function(self, signature: str, body: Sequence[str], comment: str) -> None:
-        """Writes a function, what it is above it."""
-        lines = "\n".join(f"    {line}" for line in body)
-        self._parts.append(f"/* {comment} */\n{signature}\n{{\n{lines}\n}}\n")
+    def _function(self, signature: str, body: Sequence[str], note: str) -> None:
+        """Writes a function, what it computes above it."""
+        self._parts.append(function(signature, body, note))
 
 
 def _square_lines(name: str, count: int) -> list[str]:
@@ -150,7 +156,8 @@ def _square_lines(name: str, count: int) -> list[str]:
         f"    for (i = 0; i < {count}; i++)",
         f"        for (j = 0; j < {count}; j++)",
         "            for (l = 0; l < GPMPC_AUGMENTED; l++)",
-        f"                add_scaled(W[i * {count} + j] * rows[i * GPMPC_AUGMENTED + l],",
+        f"                add_scaled(W[i * {count} + j]",
+        "                           * rows[i * GPMPC_AUGMENTED + l],",
         "                           rows + j * GPMPC_AUGMENTED, problem->Z[k][l],",
         "                           GPMPC_AUGMENTED);",
         "}",

@@ -53,6 +53,26 @@ def integers(name: str, values: Sequence[int], comment: str = "") -> str:
     return f"{head}static const int {name}[{len(listed)}] = {{{body}}};\n"
 
 
+def function(signature: str, body: Sequence[str], note: str) -> str:
+    """Returns a function, what it computes above it."""
+    lines = "\n".join(f"    {line}" for line in body)
+    return f"/* {note} */\n{signature}\n{{\n{lines}\n}}\n"
+
+
+def split_jacobian(rows: int, n: int, m: int) -> list[str]:
+    """Returns the lines of a loop over ``i`` that write A and B, where A is wanted.
+
+    They are the columns of ``jacobian`` (rows, n + m) by the state and by the input.
+    """
+    d = n + m
+    return [
+        f"for (i = 0; i < {rows} && A; i++) {{",
+        f"    copy(jacobian + i * {d}, A + i * {n}, {n});",
+        f"    copy(jacobian + i * {d} + {n}, B + i * {m}, {m});",
+        "}",
+    ]
+
+
 def comment(text: str) -> str:
     """Returns text that no comment of C ends early."""
     return text.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/")

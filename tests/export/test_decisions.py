@@ -10,7 +10,14 @@ import torch
 from gpmpc.export import CompiledController, CompiledLoop
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.models import Affine, DelayedModel, DisturbedModel, ResidualModel
+from gpmpc.models import (
+    Affine,
+    CasadiFunction,
+    DelayedModel,
+    DisturbedModel,
+    KnownModel,
+    ResidualModel,
+)
 from gpmpc.mpc import (
     GPMPC,
     Box,
@@ -235,3 +242,34 @@ def test_a_failed_step_knows_no_violation():
     failed = compiled.control(lost, origin, decision)
     assert failed.status is Status.INVALID_MEASUREMENT
     assert np.isnan(failed.violation)
+
+
+def test_every_operation_of_casadi_is_written():
+    """One state is driven by the sum of operations, which the plan linearises."""
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u")
+    a = x[0]
+    b = 2.0 + casadi.sin(x[1])  # positive
+    c = 0.4 * casadi.sin(a) + 0.1 * u  # between -1 and 1
+    terms = [
+        *(casadi.asin(c), casadi.acos(c), casadi.atanh(c), casadi.atan(a)),
+        *(casadi.sinh(a), casadi.cosh(a), casadi.asinh(a), casadi.acosh(b)),
+        *(casadi.tanh(u), casadi.tan(c), casadi.exp(c), casadi.expm1(c)),
+        *(casadi.log(b), casadi.log1p(b), casadi.erf(a), casadi.sqrt(b)),
+        *(casadi.floor(a), casadi.ceil(a), casadi.sign(a), casadi.fabs(a)),
+        *(casadi.hypot(a, b), casadi.fmod(a, b), casadi.copysign(b, a), b**a),
+        *(casadi.fmin(a, c), casadi.fmax(a, c), casadi.atan2(a, b), a / b),
+        *(casadi.if_else(a < c, a, c), casadi.if_else(a <= c, c * u, b)),
+        casadi.if_else(casadi.logic_or(a == b, casadi.logic_not(a > c)), u, a),
+        casadi.if_else(casadi.logic_and(a != b, a > c), u, a),
+        casadi.if_else(a > 10.0, casadi.log(a - 10.0), u),  # NaN, not chosen
+    ]
+    weighed = sum((0.01 + 0.001 * i) * term for i, term in enumerate(terms))
+    after = casadi.vertcat(0.8 * a + 0.1 * weighed + u, 0.5 * x[1] + weighed)
+    model = KnownModel(CasadiFunction(casadi.Function("f", [x, u], [after])), 2, 1)
+    controller = gpmpc(Problem(WEIGHTS, TORQUES), model, covariance="none")
+    python = ControlLoop(controller)
+    compiled = CompiledLoop(controller, compiler=COMPILER)
+    for measured, reference in questions(controller, 60):
+        expected = python.input(measured, reference)
+        assert np.abs(compiled.input(measured, reference) - expected).max() < 1e-9
