@@ -1,7 +1,7 @@
 """Holds exported controllers to the decisions of Python, question by question.
 
     .venv/bin/python -m benchmarks.export [--questions 100000] [--cases quadrotor-10 ..]
-                                          [--precisions double float] [--seconds 0]
+                                          [--precisions double float]
 
 Six controllers fly in closed loops of Python: the quadrotor of the paper with a
 horizon of 10 and of 20 (chance constraints of its position), a learned cart-pole that
@@ -29,7 +29,14 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions, standardize
 from gpmpc.gp.casadi_ import successor_function
 from gpmpc.models import Affine, CasadiFunction, DelayedModel, ResidualModel
-from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Tracking
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+)
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise, closed_loop
 from gpmpc.systems import cart_pole, step_many, stirred_tank
@@ -55,6 +62,7 @@ class Comparison:
         differences: Of the inputs (questions, m).
         other_statuses: Pairs of names, where they differ.
         statuses: How often Python's decisions had each.
+        inputs: Python's (questions, m).
         seconds: Of both (questions, 2).
     """
 
@@ -235,8 +243,6 @@ def late_pole() -> Case:
 
 def _fly_late_pole(flown: Any, planned: DelayedModel, seed: int) -> None:
     """Flies one episode of the late pole."""
-    from gpmpc.mpc import Reference
-
     delay = delayed_pole.DELAY
     horizon = delayed_pole.HORIZON
     pole = delayed_pole.pole

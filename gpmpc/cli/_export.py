@@ -39,7 +39,9 @@ def export(arguments: argparse.Namespace) -> Result:
         export_c(controller, folder, arguments.precision, policy)
         questions = list(_questions(run, experiment, controller))
         steps = write_replay(controller, questions, folder / "replay.txt", policy)
-    lines = [f"written to {folder}: src/gpmpc.h, src/gpmpc.c, and a replay of {steps}"]
+    lines = [
+        f"written to {folder}: src/gpmpc.h, src/gpmpc.c, and a replay of {steps} steps"
+    ]
     data: dict[str, Any] = {"folder": str(folder), "steps": steps}
     if shutil.which("cc"):
         with console.status("compiling"):
@@ -102,9 +104,9 @@ def _measure(
     """Returns memory and times of the compiled code, and how it differs."""
     python = ControlLoop(controller, policy)
     compiled = CompiledLoop(controller, precision, policy)
-    differences = [0.0]
+    differences = []
     other_statuses = 0
-    seconds = [0.0]
+    seconds = []
     for measured, reference in questions:
         expected = python.input(measured, reference)
         input = compiled.input(measured, reference)
@@ -114,8 +116,8 @@ def _measure(
         seconds.append(compiled.seconds)
     return {
         "memory_bytes": compiled.memory_bytes,
-        "median_us": 1e6 * float(np.median(seconds)),
-        "longest_us": 1e6 * max(seconds),
-        "largest_difference": max(differences),
+        "median_us": 1e6 * float(np.median(seconds or [0.0])),
+        "longest_us": 1e6 * max(seconds, default=0.0),
+        "largest_difference": max(differences, default=0.0),
         "other_statuses": int(other_statuses),
     }

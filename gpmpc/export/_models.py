@@ -9,7 +9,7 @@ import numpy as np
 from gpmpc._dynamics import to_array
 from gpmpc.exceptions import SettingError
 from gpmpc.export._expressions import expansion_lines, graph_of_tape, value_lines
-from gpmpc.export._text import Numbers, integers
+from gpmpc.export._text import Numbers, function, integers, split_jacobian
 from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, DelayedModel, DisturbedModel, KnownModel, ResidualModel
 from gpmpc.models._wrapper import LinearWrapper
@@ -33,7 +33,6 @@ class ModelWriter:
 
     Attributes:
         memory: Numbers that the model's functions are lent to work in.
-        points: Points of all GPs, by GP.
     """
 
     def __init__(self, numbers: Numbers, variances: bool, means_alone: bool):
@@ -41,9 +40,8 @@ class ModelWriter:
         self._variances = variances
         self._means_alone = means_alone
         self._parts: list[str] = []
-        self._count = 0
+        self._gps = 0
         self.memory = 0
-        self.points: list[int] = []
 
     @property
     def text(self) -> str:
@@ -99,23 +97,20 @@ class ModelWriter:
             f"real query[{d}];",
             f"real jacobian[{k * d}];",
             *self._variance_array(k),
-            "int a;",
+            "int i;",
             *self._ignored_variance,
             f"copy(x, query, {n});",
             f"copy(u, query + {n}, {m});",
             f"gp_evaluate(&{table}, query, memory, mean, A ? jacobian : 0,",
             f"            {self._wanted_variance});",
         ]
+        body += split_jacobian(k, n, m)
         if adds_state:
-            body += [f"add_scaled(1, x, mean, {n});"]
-        body += [
-            f"for (a = 0; a < {k} && A; a++) {{",
-            f"    copy(jacobian + a * {d}, A + a * {n}, {n});",
-            f"    copy(jacobian + a * {d} + {n}, B + a * {m}, {m});",
-        ]
-        if adds_state:
-            body += [f"    A[a * {n} + a] += 1;"]
-        body += ["}"]
+            body += [
+                f"add_scaled(1, x, mean, {n});",
+                f"for (i = 0; i < {n} && A; i++)",
+                f"    A[i * {n} + i] += 1;",
+            ]
         if self._variances:
             body += _diagonal_variance(k)
         self._function(_SIGNATURE.format(name=name), body, f"x+ = {what}, f by GPs")
@@ -124,10 +119,10 @@ class ModelWriter:
         """Writes the tables of GPs over the same points; returns their name."""
         if str(gp.dtype) != "torch.float64":
             raise SettingError("model", f"must be in float64; got {gp.dtype}")
-        prefix = f"gp{len(self.points)}"
+        prefix = f"gp{self._gps}"
+        self._gps += 1
         size, d = gp.features.shape
         k = gp.output_dim
-        self.points.append(size)
         self.memory = max(self.memory, (d + 2) * size)
         features = to_array(gp.features)
         lengthscales = to_array(gp.lengthscales)
@@ -157,7 +152,8 @@ class ModelWriter:
         parts.append(
             f"static const gp_tables {prefix} = {{\n"
             f"    {size}, {d}, {k}, {prefix}_points, {prefix}_scales,\n"
-            f"    {prefix}_log_signal, {prefix}_weights, {prefix}_offset, {cholesky}}};\n"
+            f"    {prefix}_log_signal, {prefix}_weights, {prefix}_offset,\n"
+            f"    {cholesky}}};\n"
         )
         self._parts.append("\n".join(parts))
         return prefix
@@ -188,7 +184,6 @@ class ModelWriter:
             )
         )
         self._write_nominal(model.nominal, n, m, f"{name}_nominal")
-        sines = set(features.sines.tolist())
         body = [
             f"real query[{d}];",
             f"real slopes[{d}];",
@@ -198,47 +193,15 @@ class ModelWriter:
             "int a, i, j;",
             *self._ignored_variance,
             f"{name}_nominal(x, u, mean, A, B);",
-            f"for (i = 0; i < {d}; i++) {{",
-            f"    query[i] = i < {features.dim} ? x[{name}_columns[i]]",
-            f"                                  : u[{name}_columns[i]];",
-            "    slopes[i] = 1;",
-            "}",
-        ]
-        for i in sorted(sines):
-            body += [
-                f"query[{i}] = SIN(x[{columns[i]}]);",
-                f"query[{i + 1}] = COS(x[{columns[i]}]);",
-                f"slopes[{i}] = query[{i + 1}];",
-                f"slopes[{i + 1}] = -query[{i}];",
-            ]
-        body += [
+            *_query_lines(features, name),
             f"gp_evaluate(&{table}, query, memory, residual, A ? jacobian : 0,",
             f"            {self._wanted_variance});",
             f"for (i = 0; i < {n}; i++)",
             f"    mean[i] += dot({name}_effect + i * {k}, residual, {k});",
-            f"for (i = 0; i < {n} && A; i++)",
-            f"    for (a = 0; a < {k}; a++) {{",
-            f"        const real effect = {name}_effect[i * {k} + a];",
-            f"        for (j = 0; j < {d} && effect != 0; j++) {{",
-            f"            real slope = effect * jacobian[a * {d} + j] * slopes[j];",
-            f"            if (j < {features.dim})",
-            f"                A[i * {n} + {name}_columns[j]] += slope;",
-            "            else",
-            f"                B[i * {m} + {name}_columns[j]] += slope;",
-            "        }",
-            "    }",
-        ]
-        propagated = [
-            f"for (i = 0; i < {n} && V; i++)",
-            f"    for (j = 0; j < {n}; j++) {{",
-            f"        V[i * {n} + j] = 0;",
-            f"        for (a = 0; a < {k}; a++)",
-            f"            V[i * {n} + j] += {name}_effect[i * {k} + a] * variance[a]",
-            f"                              * {name}_effect[j * {k} + a];",
-            "    }",
+            *_residual_slope_lines(model, name),
         ]
         if self._variances:
-            body += propagated
+            body += _residual_variance_lines(n, k, name)
         self._function(
             _SIGNATURE.format(name=name),
             body,
@@ -308,10 +271,7 @@ class ModelWriter:
         body += [
             f"fill(jacobian, 0, {n * d});",
             f"{name}_expansion(x, u, mean, jacobian);",
-            f"for (i = 0; i < {n} && A; i++) {{",
-            f"    copy(jacobian + i * {d}, A + i * {n}, {n});",
-            f"    copy(jacobian + i * {d} + {n}, B + i * {m}, {m});",
-            "}",
+            *split_jacobian(n, n, m),
         ]
         self._nominal_function(name, body, "f0 as the model takes it")
 
@@ -349,7 +309,7 @@ class ModelWriter:
             f"real by_state[{p * p}];",
             f"real by_input[{p * m}];",
             *self._variance_array(p * p),
-            "int i, j;",
+            "int i;",
             *self._ignored_variance,
             f"for (i = 0; i < {m}; i++)",
             f"    acting[i] = dot({name}_Z + i * {n}, x, {n})",
@@ -358,29 +318,12 @@ class ModelWriter:
             f"      {self._wanted_variance});",
             f"for (i = 0; i < {n}; i++)",
             f"    mean[i] = dot({name}_L + i * {n}, x, {n})",
-            f"              + dot({name}_M + i * {m}, u, {m}) + (i < {p} ? next[i] : 0);",
-            "if (A) {",
-            f"    copy({name}_L, A, {n * n});",
-            f"    copy({name}_M, B, {n * m});",
-            f"    for (i = 0; i < {p}; i++) {{",
-            f"        add_scaled(1, by_state + i * {p}, A + i * {n}, {p});",
-            f"        for (j = 0; j < {m}; j++) {{",
-            f"            const real slope = by_input[i * {m} + j];",
-            f"            add_scaled(slope, {name}_Z + j * {n}, A + i * {n}, {n});",
-            f"            add_scaled(slope, {name}_W + j * {m}, B + i * {m}, {m});",
-            "        }",
-            "    }",
-            "}",
-        ]
-        padded = [
-            "if (V) {",
-            f"    fill(V, 0, {n * n});",
-            f"    for (i = 0; i < {p}; i++)",
-            f"        copy(variance + i * {p}, V + i * {n}, {p});",
-            "}",
+            f"              + dot({name}_M + i * {m}, u, {m})",
+            f"              + (i < {p} ? next[i] : 0);",
+            *_wrapped_slope_lines(n, m, p, name),
         ]
         if self._variances:
-            body += padded
+            body += _padded_variance_lines(n, p)
         what = "z+ = [f(x, Z z + W u); 0] + L z + M u"
         if isinstance(model, DelayedModel):
             what += f": inputs act {model.delay:g} steps late"
@@ -398,8 +341,90 @@ class ModelWriter:
 
     def _function(self, signature: str, body: Sequence[str], comment: str) -> None:
         """Writes a function, its equation above it."""
-        lines = "\n".join(f"    {line}" for line in body)
-        self._parts.append(f"/* {comment} */\n{signature}\n{{\n{lines}\n}}\n")
+        self._parts.append(function(signature, body, comment))
+
+
+def _query_lines(features: Any, name: str) -> list[str]:
+    """Returns the lines that write the features, and their slopes by what they read."""
+    columns = features.columns.tolist()
+    lines = [
+        f"for (i = 0; i < {features.dim + len(features.inputs)}; i++) {{",
+        f"    query[i] = i < {features.dim} ? x[{name}_columns[i]]",
+        f"                                  : u[{name}_columns[i]];",
+        "    slopes[i] = 1;",
+        "}",
+    ]
+    for i in sorted(features.sines.tolist()):
+        lines += [
+            f"query[{i}] = SIN(x[{columns[i]}]);",
+            f"query[{i + 1}] = COS(x[{columns[i]}]);",
+            f"slopes[{i}] = query[{i + 1}];",
+            f"slopes[{i + 1}] = -query[{i}];",
+        ]
+    return lines
+
+
+def _residual_slope_lines(model: ResidualModel, name: str) -> list[str]:
+    """Returns the lines that add the derivatives of B d to A and B."""
+    k = model.residual.output_dim
+    features = model.features
+    d = features.dim + len(features.inputs)
+    return [
+        f"for (i = 0; i < {model.state_dim} && A; i++)",
+        f"    for (a = 0; a < {k}; a++) {{",
+        f"        const real effect = {name}_effect[i * {k} + a];",
+        f"        for (j = 0; j < {d} && effect != 0; j++) {{",
+        f"            real slope = effect * jacobian[a * {d} + j] * slopes[j];",
+        f"            if (j < {features.dim})",
+        f"                A[i * {model.state_dim} + {name}_columns[j]] += slope;",
+        "            else",
+        f"                B[i * {model.input_dim} + {name}_columns[j]] += slope;",
+        "        }",
+        "    }",
+    ]
+
+
+def _residual_variance_lines(n: int, k: int, name: str) -> list[str]:
+    """Returns the lines that write V = B diag(variance) B'."""
+    return [
+        f"for (i = 0; i < {n} && V; i++)",
+        f"    for (j = 0; j < {n}; j++) {{",
+        f"        V[i * {n} + j] = 0;",
+        f"        for (a = 0; a < {k}; a++)",
+        f"            V[i * {n} + j] += {name}_effect[i * {k} + a] * variance[a]",
+        f"                              * {name}_effect[j * {k} + a];",
+        "    }",
+    ]
+
+
+def _wrapped_slope_lines(n: int, m: int, p: int, name: str) -> list[str]:
+    """Returns the lines that write A and B of a wrapper around p states."""
+    return [
+        "if (A) {",
+        "    int j;",
+        f"    copy({name}_L, A, {n * n});",
+        f"    copy({name}_M, B, {n * m});",
+        f"    for (i = 0; i < {p}; i++) {{",
+        f"        add_scaled(1, by_state + i * {p}, A + i * {n}, {p});",
+        f"        for (j = 0; j < {m}; j++) {{",
+        f"            const real slope = by_input[i * {m} + j];",
+        f"            add_scaled(slope, {name}_Z + j * {n}, A + i * {n}, {n});",
+        f"            add_scaled(slope, {name}_W + j * {m}, B + i * {m}, {m});",
+        "        }",
+        "    }",
+        "}",
+    ]
+
+
+def _padded_variance_lines(n: int, p: int) -> list[str]:
+    """Returns the lines that write V of a wrapper, zero but for the p inner states."""
+    return [
+        "if (V) {",
+        f"    fill(V, 0, {n * n});",
+        f"    for (i = 0; i < {p}; i++)",
+        f"        copy(variance + i * {p}, V + i * {n}, {p});",
+        "}",
+    ]
 
 
 def _diagonal_variance(k: int) -> list[str]:
@@ -407,8 +432,8 @@ def _diagonal_variance(k: int) -> list[str]:
     return [
         "if (V) {",
         f"    fill(V, 0, {k * k});",
-        f"    for (a = 0; a < {k}; a++)",
-        f"        V[a * {k} + a] = variance[a];",
+        f"    for (i = 0; i < {k}; i++)",
+        f"        V[i * {k} + i] = variance[i];",
         "}",
     ]
 

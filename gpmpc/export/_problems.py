@@ -7,7 +7,7 @@ import numpy as np
 from gpmpc.export._functions import FunctionWriter
 from gpmpc.export._text import Numbers, comment, integers
 from gpmpc.mpc import GPMPC
-from gpmpc.mpc._constraints import _FixedRows
+from gpmpc.mpc._constraints import ConstraintRows, _FixedRows
 
 Array = np.ndarray
 
@@ -15,6 +15,21 @@ Array = np.ndarray
 _FLOAT_TOLERANCE = 1e-4
 # The largest price in float, in the cost's largest weight.
 _FLOAT_PRICE = 1e3
+
+
+_COMMENTS = {
+    "GPMPC_STATES": "n",
+    "GPMPC_INPUTS": "m",
+    "GPMPC_HORIZON": "H, the number of predicted states",
+    "GPMPC_STAGES": "stage models: H, or one that is held",
+    "GPMPC_ROWS": "rows of the states' constraints at a stage, r",
+    "GPMPC_PARAMETERS": "of outputs and inequalities, q",
+    "GPMPC_ITERATIONS": "changes of the working set; 0: 100 + 10 per constraint",
+    "GPMPC_MODEL_MEMORY": "numbers that the model works in",
+    "GPMPC_PENALIZED": "what R weighs: 0 inputs, 1 deviations, 2 increments",
+    "GPMPC_TOLERANCE": "of a solution, as a share of its size",
+    "GPMPC_DISTURBANCE_GAIN": "of the estimate of a constant error",
+}
 
 
 class Definitions(NamedTuple):
@@ -74,21 +89,6 @@ def definitions(
     if numbers.precision == "float":
         tolerance = max(tolerance, _FLOAT_TOLERANCE)
     angles = list(controller.problem.cost.angle_indices)
-    flags = {
-        "GPMPC_IS_FLOAT": numbers.precision == "float",
-        "GPMPC_HAS_RATES": controller.problem.input_rates.finite,
-        "GPMPC_SOFT": constraints.soft,
-        "GPMPC_ELASTIC": constraints.gives_way,
-        "GPMPC_SMOOTH": constraints.smooth,
-        "GPMPC_OUTPUTS": bool(controller.problem.outputs),
-        "GPMPC_TUBES": tightens(controller),
-        "GPMPC_FEEDBACK": settings.feedback,
-        "GPMPC_ROLLS_OUT": rolls_out(controller),
-        "GPMPC_HELD": settings.is_held,
-        "GPMPC_INCREMENTAL": settings.is_incremental,
-        "GPMPC_ESTIMATES": gain > 0,
-        "GPMPC_HOLDS": on_failure == "hold",
-    }
     values = {
         "GPMPC_STATES": str(prediction.state_dim),
         "GPMPC_INPUTS": str(prediction.input_dim),
@@ -106,21 +106,30 @@ def definitions(
         "GPMPC_TOLERANCE": f"(gpmpc_real){tolerance!r}",
         "GPMPC_DISTURBANCE_GAIN": f"(gpmpc_real){float(gain)!r}",
     }
+    flags = _flags(controller, numbers, on_failure)
     values |= {name: str(int(flag)) for name, flag in flags.items()}
-    comments = {
-        "GPMPC_STATES": "n",
-        "GPMPC_INPUTS": "m",
-        "GPMPC_HORIZON": "H, the number of predicted states",
-        "GPMPC_STAGES": "stage models: H, or one that is held",
-        "GPMPC_ROWS": "rows of the states' constraints at a stage, r",
-        "GPMPC_PARAMETERS": "of outputs and inequalities, q",
-        "GPMPC_ITERATIONS": "changes of the working set; 0: 100 + 10 per constraint",
-        "GPMPC_MODEL_MEMORY": "numbers that the model works in",
-        "GPMPC_PENALIZED": "what R weighs: 0 inputs, 1 deviations, 2 increments",
-        "GPMPC_TOLERANCE": "of a solution, as a share of its size",
-        "GPMPC_DISTURBANCE_GAIN": "of the estimate of a constant error",
+    return Definitions(values, _COMMENTS)
+
+
+def _flags(controller: GPMPC, numbers: Numbers, on_failure: str) -> dict[str, bool]:
+    """Returns which parts of the code are compiled."""
+    settings = controller.prediction.settings
+    constraints = controller.prediction.constraints
+    return {
+        "GPMPC_IS_FLOAT": numbers.precision == "float",
+        "GPMPC_HAS_RATES": controller.problem.input_rates.finite,
+        "GPMPC_SOFT": constraints.soft,
+        "GPMPC_ELASTIC": constraints.gives_way,
+        "GPMPC_SMOOTH": constraints.smooth,
+        "GPMPC_OUTPUTS": bool(controller.problem.outputs),
+        "GPMPC_TUBES": tightens(controller),
+        "GPMPC_FEEDBACK": settings.feedback,
+        "GPMPC_ROLLS_OUT": rolls_out(controller),
+        "GPMPC_HELD": settings.is_held,
+        "GPMPC_INCREMENTAL": settings.is_incremental,
+        "GPMPC_ESTIMATES": settings.disturbance_gain > 0,
+        "GPMPC_HOLDS": on_failure == "hold",
     }
-    return Definitions(values, comments)
 
 
 def tables(controller: GPMPC, numbers: Numbers) -> str:
@@ -130,14 +139,7 @@ def tables(controller: GPMPC, numbers: Numbers) -> str:
     cost = prediction.costs.quadratic
     limits = prediction.limits
     constraints = prediction.constraints
-    rows = constraints._rows
-    if isinstance(rows, _FixedRows):
-        fixed = rows._rows
-        gradients = fixed.E[0]
-        lower, upper = fixed.lower, fixed.upper
-    else:
-        linear = rows._linear
-        gradients, lower, upper = linear.F, linear.lower, linear.upper
+    gradients, lower, upper = _linear_rows(constraints)
     table = numbers.table
     parts = [
         table("state_weights", cost.state[:, 0], "Q of s_1 .. (n, n)"),
@@ -155,29 +157,40 @@ def tables(controller: GPMPC, numbers: Numbers) -> str:
         integers("cost_angles", problem.cost.angle_indices, "errors modulo 2 pi"),
         integers("state_angles", prediction.angles, "angles of the cost or the model"),
     ]
+    return "\n".join([*parts, *_optional_tables(controller, numbers)])
+
+
+def _linear_rows(constraints: ConstraintRows) -> tuple[Array, Array, Array]:
+    """Returns gradients (r, n) of the rows, and their bounds (H, r), untightened."""
+    rows = constraints._rows
+    if isinstance(rows, _FixedRows):
+        return rows._rows.E[0], rows._rows.lower, rows._rows.upper
+    linear = rows._linear
+    return linear.F, linear.lower, linear.upper
+
+
+def _optional_tables(controller: GPMPC, numbers: Numbers) -> list[str]:
+    """Returns the tables of elastic, smooth and tightened rows, where there are any."""
+    prediction = controller.prediction
+    constraints = prediction.constraints
+    parts = []
     if constraints.gives_way:
-        parts.append(
-            integers(
-                "row_is_elastic", constraints.elastic.tolist(), "rows that give way"
-            )
-        )
+        elastic = constraints.elastic.tolist()
+        parts.append(integers("row_is_elastic", elastic, "rows that give way"))
     if constraints.smooth:
         smooth = np.zeros(constraints.per_stage, dtype=int)
-        for part in getattr(rows, "_smooth", ()):
+        for part in getattr(constraints._rows, "_smooth", ()):
             smooth[part.columns] = 1
         parts.append(integers("row_is_smooth", smooth.tolist(), "linearised rows"))
     if tightens(controller):
-        parts.append(table("row_kappas", _kappas(controller), "deviations to a side"))
+        kappas = _kappas(controller)
         noise = prediction.linearizer._noise
-        n = prediction.state_dim
-        parts.append(
-            table(
-                "process_noise",
-                np.zeros((n, n)) if noise is None else noise,
-                "added to the covariance of a stage (n, n)",
-            )
-        )
-    return "\n".join(parts)
+        if noise is None:
+            noise = np.zeros((prediction.state_dim, prediction.state_dim))
+        note = "added to the covariance of a stage (n, n)"
+        parts.append(numbers.table("row_kappas", kappas, "deviations to a side"))
+        parts.append(numbers.table("process_noise", noise, note))
+    return parts
 
 
 def _prices(controller: GPMPC, numbers: Numbers) -> Array:
