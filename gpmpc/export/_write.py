@@ -103,8 +103,9 @@ def _texts(controller: GPMPC, numbers: Numbers, on_failure: str) -> tuple[str, s
             "",
         ]
     )
+    gps = _part("gp.c") if model.memory else ""  # a known model has none
     generated = "\n".join(
-        [_part("gp.c"), model.text, tables(controller, numbers), functions.text]
+        [gps, model.text, tables(controller, numbers), functions.text]
     )
     core = _part("core.c")
     core = core.replace("/*{model}*/", generated).replace("/*{qp}*/", _part("qp.c"))

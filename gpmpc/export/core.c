@@ -4,6 +4,11 @@
 
 typedef gpmpc_real real;
 
+/* The sums of GPs are taken in double whatever the precision is: a GP of smooth
+   dynamics is a sum of large terms that cancel, of which float would leave two
+   digits. */
+typedef double wide;
+
 enum {
     n = GPMPC_STATES,
     m = GPMPC_INPUTS,

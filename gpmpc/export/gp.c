@@ -1,8 +1,3 @@
-/* The sums of GPs are taken in double whatever the precision is: a GP of smooth
-   dynamics is a sum of large terms that cancel, of which float would leave two
-   digits. */
-typedef double wide;
-
 /* The exponential without branch and table (Cody and Waite, 1980): x = j ln 2 + y with
    |y| <= ln(2) / 2, exp(x) = 2^j exp(y), exp(y) = 1 + y + y^2 g(y). Adding ``SHIFT``
    leaves j in the lowest bits, biased as an exponent is; there 2^j is made of it. */
