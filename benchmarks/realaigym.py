@@ -303,7 +303,10 @@ def league_controller(base: type, pilot: Flies) -> Any:
 
 
 ENTRY = '''\
-"""GP-MPC in the league's interface: this file and the model beside it stand in leaderboard/{robot}/simulation_v3."""
+"""GP-MPC in the league's interface.
+
+This file and the model beside it stand in leaderboard/{robot}/simulation_v3.
+"""
 
 from pathlib import Path
 

@@ -228,8 +228,9 @@ class Sweep:
         retries = self.config.retries
         if self.flown_again:
             self.console.out(
-                f"{len(self.flown_again)} of the runs were flown again, since a cluster "
-                f"or a crash had ended them; at most {retries} times each (retries)",
+                f"{len(self.flown_again)} of the runs were flown again, since a "
+                "cluster or a crash had ended them; "
+                f"at most {retries} times each (retries)",
                 highlight=False,
             )
         if self.given_up:

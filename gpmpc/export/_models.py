@@ -131,7 +131,8 @@ class ModelWriter:
             f"/* GPs {prefix}: k = {k} outputs over N = {size} points of {d} features",
             "",
             "   m_a(x~) = offset_a + sum_i beta_ai k_a(x~_i, x~)",
-            "   k_a(x~_i, x~) = exp(log sf2_a - 1/2 sum_d (x~_id - x~_d)^2 / l_ad^2) */",
+            "   k_a(x~_i, x~) =",
+            "       exp(log sf2_a - 1/2 sum_d (x~_id - x~_d)^2 / l_ad^2) */",
             table(f"{prefix}_points", features.T, "x~, a row for each feature (d, N)"),
             table(f"{prefix}_scales", lengthscales**-2.0, "1 / l^2 (k, d)"),
             table(

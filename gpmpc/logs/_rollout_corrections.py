@@ -138,7 +138,8 @@ def _fit_corrections(
     Args:
         kinematics: Of the model.
         rollouts: That are corrected.
-        knots: Steps of the corrections; each has the penalty of the nearest judged step.
+        knots: Steps of the corrections; each has the penalty of the nearest judged
+            step.
         judged_steps: Those of the penalties.
         alternatives: Penalties (judged steps, groups).
     """

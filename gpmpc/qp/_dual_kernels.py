@@ -1,7 +1,8 @@
 """The compiled entry point of the dual active set: a warm-started, judged solve.
 
-``solve_kernel`` minimises ``1/2 x'Px + q'x`` subject to ``lower <= [x; Gx] <= upper`` from a
-guessed working set and writes a record (``gpmpc.qp._record``). The guess is corrected
+``solve_kernel`` minimises ``1/2 x'Px + q'x`` subject to
+``lower <= [x; Gx] <= upper`` from a guessed working set and writes a record
+(``gpmpc.qp._record``). The guess is corrected
 until its multipliers have the right signs, then by the dual iteration
 (``gpmpc.qp._dual_iteration``). Nothing is believed without its residuals: x is refined
 on its working set (``gpmpc.qp._refinement``), and handed back to the iteration while a

@@ -9,7 +9,8 @@ from tests.cli.command import forked, gpmpc
 
 ROW = " ".join(str(i / 7) for i in range(15))
 RESULTS = Path(
-    "outputs/tables/nmpc-seed0/data.samples=12,model.restarts=0,sizes=[5],trajectory=elliptical"
+    "outputs/tables/nmpc-seed0/"
+    "data.samples=12,model.restarts=0,sizes=[5],trajectory=elliptical"
 )
 FILES = [
     f"ds_nmpc_{t}_{s}.txt"

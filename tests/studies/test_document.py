@@ -116,7 +116,8 @@ PAGE = """</style></head><body>
 <p>It *is* so.</p>
 <div class="figures"><img alt="a" src="data:image/png;base64,iVBORw=="></div>
 <h2>Runs &amp; more</h2>
-<div class="wide"><table><thead><tr><th>kind</th><th>n, all</th><th>RMSE [m]</th></tr></thead><tbody>
+<div class="wide"><table><thead><tr>\
+<th>kind</th><th>n, all</th><th>RMSE [m]</th></tr></thead><tbody>
 <tr><td>a</td><td>3<small>1 failed</small></td><td>0.123</td></tr>
 <tr><td>a</td><td>[2]</td><td>—</td></tr>
 <tr><td>b</td><td>*1</td><td>1.50e-7</td></tr>
@@ -130,7 +131,8 @@ PAGE = """</style></head><body>
 <h2>To fill</h2><pre>l &lt; 1</pre>
 <h2>Eleven</h2><details><summary>11 lines</summary><pre>11 times x</pre></details>
 <h2>Ten</h2><pre>10 times x</pre>
-<h2>Runs</h2><details><summary>1 folders</summary><ul><li><a href="../a%20b/">run/&lt;1&gt;</a></li></ul></details>
+<h2>Runs</h2><details><summary>1 folders</summary><ul>\
+<li><a href="../a%20b/">run/&lt;1&gt;</a></li></ul></details>
 </body></html>
 """
 
