@@ -1,33 +1,43 @@
 """Real clusters of two nodes on this machine, and what must hold on them.
 
-    make cluster                                        # all of it, for half an hour
+    make cluster                                        # all of it
     .venv/bin/python -m benchmarks.cluster --on slurm --only memory
 
 Starts Slurm without accounting, Slurm with it, and Ray, flies sweeps on each while it
 kills, cancels and hides, and prints a table. After every act each run is accounted for,
 has the numbers of the basic launcher, the exit code is true, and no process is left.
+It takes half an hour on two idle cores, and has patience where they are busy.
 
 Slurm needs root and the packages slurmctld, slurmd, slurm-client and munge of Debian or
 Ubuntu, with accounting also slurmdbd and mariadb-server; Ray needs gpmpc[ray]. What is
 missing is said, and nothing is installed. Everything is bound to loopback, and stopped
-at the end. Exit code 1 where an act fails, or nothing could be played.
+at the end; what an earlier call left that was killed is ended first. Exit code 1 where
+an act fails, something is left, or nothing could be played.
 """
 
 import argparse
 import os
 import re
+import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Mapping
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from benchmarks.cluster import ray_nodes, slurm
 from benchmarks.cluster.acts import MANY, Act, RayActs, SlurmActs, Stage, run
-from benchmarks.cluster.processes import kill, processes_with, running
-from benchmarks.cluster.sweeps import STAGE, Sweep
+from benchmarks.cluster.processes import command_of, kill, processes_with, running
+from benchmarks.cluster.sweeps import Sweep
 
 _CLUSTERS = ("slurm", "slurm-accounting", "ray")
+_PREFIX = "gpmpc-acts-"  # of the folder of a call
+_STAGE = "GPMPC_STAGE"  # variable: that folder, in whatever the call started
+_ENDING = 60.0  # within which the processes of clusters that were stopped are gone [s]
 
 
 def main() -> int:
@@ -40,19 +50,70 @@ def main() -> int:
     for number in (signal.SIGTERM, signal.SIGINT):  # what was started is stopped
         signal.signal(number, lambda *_: sys.exit("stopped"))
     rows = []
-    with tempfile.TemporaryDirectory(prefix="gpmpc-cluster-") as name:
-        folder = Path(name)
-        folder.chmod(0o755)
-        try:
-            stage = Stage(folder, _reference(folder, arguments.runs))
-            for cluster in arguments.on or _CLUSTERS:
-                rows += _play(cluster, stage, arguments.only)
-        finally:
-            kill(processes_with(f"{STAGE}={folder}"))
+    _end_killed_calls()
+    with _stage_folder() as folder:
+        stage = Stage(folder, _reference(folder, arguments.runs))
+        for cluster in arguments.on or _CLUSTERS:
+            rows += _play(cluster, stage, arguments.only)
+        left = _left_running(folder)
     print()
     for where, act, outcome, seconds in rows:
         print(f"{where:17} {act:40} {seconds:5.0f} s  {outcome}")
-    return 0 if rows and all(outcome == "pass" for *_, outcome, _ in rows) else 1
+    print(f"left running: {'; '.join(left) or 'nothing'}")
+    all_passed = all(outcome == "pass" for *_, outcome, _ in rows)
+    return 0 if rows and all_passed and not left else 1
+
+
+@contextmanager
+def _stage_folder() -> Iterator[Path]:
+    """Makes the folder of a call; in the end it, and what the call started, are gone.
+
+    A lock in it says that the call lives.
+    """
+    folder = Path(tempfile.mkdtemp(prefix=_PREFIX))
+    folder.chmod(0o755)
+    os.environ[_STAGE] = str(folder)
+    with FileLock(folder / ".lock"):
+        try:
+            yield folder
+        finally:
+            _remove(folder)
+
+
+def _end_killed_calls() -> None:
+    """Ends what calls left that were killed."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        try:
+            with FileLock(folder / ".lock", blocking=False):
+                print(f"ending what is left of {folder}", flush=True)
+                _remove(folder)
+        except Timeout:
+            print(f"{folder}: another call, which is playing", flush=True)
+
+
+def _remove(folder: Path) -> None:
+    """Kills what was started for a call, and removes its folder."""
+    kill(_processes_of(folder))
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _processes_of(folder: Path) -> list[int]:
+    """Returns the processes that a call started, without the call itself."""
+    return [
+        process
+        for process in processes_with(f"{_STAGE}={folder}")
+        if process != os.getpid()
+    ]
+
+
+def _left_running(folder: Path) -> list[str]:
+    """Returns the commands of processes that outlive the clusters of a call."""
+    deadline = time.monotonic() + _ENDING
+    while processes := _processes_of(folder):
+        if time.monotonic() > deadline:
+            return [f"{process}: {command_of(process)}" for process in processes]
+        time.sleep(1.0)
+    return []
 
 
 def _reference(folder: Path, runs: int) -> dict[int, dict]:

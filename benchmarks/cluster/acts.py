@@ -1,7 +1,6 @@
 """What clusters do to sweeps, one act after another; each raises where it fails."""
 
 import subprocess
-import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -10,16 +9,17 @@ from typing import Any
 
 from benchmarks.cluster.processes import running
 from benchmarks.cluster.ray_nodes import RayNodes
-from benchmarks.cluster.slow import SLOW
+from benchmarks.cluster.slow import HOLD
 from benchmarks.cluster.slurm import Slurm
-from benchmarks.cluster.sweeps import Sweep, end_of
+from benchmarks.cluster.sweeps import Sweep, end_of, hold_of
 from gpmpc.studies._run_folder import RunState
 
 Act = Callable[[], None]
 MANY = 200
 _FEW = 6
-_SLOW = 8.0  # seconds that a step takes where something is to happen meanwhile
+_SHARED = ["chunk=25"]  # of the many: two rounds on two nodes of two processors
 _SLURM = ["launcher=slurm", "hydra.launcher.mem_gb=2"]
+_WALL_TIME = 3  # which only a run that hangs reaches, on a busy machine, too [min]
 
 
 @dataclass(frozen=True)
@@ -53,13 +53,14 @@ class SlurmActs:
             "a job over its wall time": self._wall_time,
             "a node killed": self._node,
             "the driver killed and called again": self._driver,
-            "two drivers on one sweep": self._two_drivers,
+            "three drivers on one sweep": self._three_drivers,
             "a node without the folder": self._blind,
         }
 
     def _many(self) -> None:
-        act = self._sweep("many", MANY, words=["chunk=10"])
-        code, _ = act.fly()
+        act = self._sweep("many", MANY, words=_SHARED)
+        code, printed = act.fly()
+        assert code == 0, printed
         hosts = {row.split("|")[2] for row in self._jobs(act).values()}
         assert hosts == {"n1", "n2"}, hosts
         act.check(code, self._stage.reference)
@@ -69,7 +70,7 @@ class SlurmActs:
             for state in ("RUNNING", "PENDING"):
                 self._slurm.ask("scancel", self._number(act, state))
 
-        act = self._sweep("cancelled", slow=_SLOW)
+        act = self._sweep("cancelled")
         self._cancelled(act, cancel, failed=2)
 
     def _all_cancelled(self) -> None:
@@ -77,7 +78,7 @@ class SlurmActs:
             array = self._number(act, "RUNNING").partition("_")[0]
             self._slurm.ask("scancel", array)
 
-        act = self._sweep("array", slow=_SLOW)
+        act = self._sweep("array")
         self._cancelled(act, cancel, failed=_FEW)
 
     def _cancelled(self, act: Sweep, cancel: Act, failed: int) -> None:
@@ -85,7 +86,6 @@ class SlurmActs:
         act.check(code, self._stage.reference)
         kinds = [error["kind"] for error in act.errors()]
         assert kinds == failed * ["cancelled"], kinds
-        act.slow = 0.0
         code, printed = act.fly()
         assert code == 0, printed
         assert f"{failed} of the runs were flown again" in printed
@@ -103,7 +103,7 @@ class SlurmActs:
         act.check(code, self._stage.reference)
 
     def _wall_time(self) -> None:
-        words = ["chunk=1", "hydra.launcher.timeout_min=1"]
+        words = ["chunk=1", f"hydra.launcher.timeout_min={_WALL_TIME}"]
         act = self._sweep("time", 1, kinds=["Slow", "Stuck"], words=words)
         code, printed = act.fly()
         act.check(code, self._stage.reference)
@@ -111,7 +111,7 @@ class SlurmActs:
         assert "hydra.launcher.timeout_min" in printed
 
     def _node(self) -> None:
-        act = self._sweep("node", slow=_SLOW)
+        act = self._sweep("node")
         code, printed = _fly_through(act, 4, lambda: self._slurm.kill_node("n1"))
         assert code == 0, printed
         act.check(code, self._stage.reference)
@@ -119,20 +119,20 @@ class SlurmActs:
         self._slurm.wait_until_idle()
 
     def _driver(self) -> None:
-        act = self._sweep("driver", slow=_SLOW)
+        act = self._sweep("driver")
         code, printed = _kill_and_repeat(act, 4)
         assert code == 0, printed
         assert len(self._jobs(act)) == _FEW  # of one array
         act.check(code, self._stage.reference)
 
-    def _two_drivers(self) -> None:
-        act = self._sweep("two", slow=2.0)
-        _start_twice(act)
+    def _three_drivers(self) -> None:
+        act = self._sweep("three")
+        _start_thrice(act, 4)
         assert len(self._jobs(act)) == _FEW
         act.check(0, self._stage.reference)
 
     def _blind(self) -> None:
-        act = self._sweep("blind", slow=2.0)
+        act = self._sweep("blind")
         act.folder.mkdir()
         self._restart_second_node(blind_to=act.folder)
         code, printed = act.fly()
@@ -144,8 +144,8 @@ class SlurmActs:
 
     def _restart_second_node(self, blind_to: Path | None = None) -> None:
         self._slurm.kill_node("n2")
+        self._slurm.wait_until_down("n2")
         self._slurm.start_node("n2", blind_to)
-        time.sleep(15.0)  # until the controller has noticed
         self._slurm.wait_until_idle()
 
     def _sweep(
@@ -154,15 +154,15 @@ class SlurmActs:
         runs: int = _FEW,
         kinds: Sequence[str] = ("Slow",),
         words: Sequence[str] = ("chunk=1",),
-        slow: float = 0.0,
     ) -> Sweep:
+        folder = self._stage.folder / f"{self._slurm.folder.name}-{name}"
+        setup = f"hydra.launcher.setup=['export {HOLD}=\"{hold_of(folder)}\"']"
         return Sweep(
-            folder=self._stage.folder / f"{self._slurm.folder.name}-{name}",
+            folder=folder,
             runs=runs,
             kinds=kinds,
-            launcher=[*_SLURM, *words],
+            launcher=[*_SLURM, setup, *words],
             environment=self._slurm.environment,
-            slow=slow,
         )
 
     def _jobs(self, act: Sweep) -> dict[int, str]:
@@ -197,42 +197,51 @@ class RayActs:
             f"{MANY} runs over two nodes": self._many,
             "a raylet killed": self._raylet,
             "the driver killed and called again": self._driver,
-            "two drivers on one sweep": self._two_drivers,
+            "three drivers on one sweep": self._three_drivers,
             "a node without the folder": self._blind,
         }
 
     def _many(self) -> None:
-        with running(_ray_nodes("many")) as nodes:
-            act = self._sweep("many", nodes, MANY, words=["chunk=10"])
+        with running(self._nodes("many")) as nodes:
+            act = self._sweep("many", nodes, MANY, words=_SHARED)
             self._check_finished(act, *act.fly())
 
     def _raylet(self) -> None:
-        with running(_ray_nodes("raylet", slow=_SLOW)) as nodes:
+        with running(self._nodes("raylet")) as nodes:
             act = self._sweep("raylet", nodes)
             end = _fly_through(act, 3, lambda: nodes.kill_node("second"))
             self._check_finished(act, *end)
 
     def _driver(self) -> None:
-        with running(_ray_nodes("driver", slow=_SLOW)) as nodes:
+        with running(self._nodes("driver")) as nodes:
             act = self._sweep("driver", nodes)
             self._check_finished(act, *_kill_and_repeat(act, 3))
 
-    def _two_drivers(self) -> None:
-        with running(_ray_nodes("two")) as nodes:
-            act = self._sweep("two", nodes)
-            _start_twice(act)
+    def _three_drivers(self) -> None:
+        with running(self._nodes("three")) as nodes:
+            act = self._sweep("three", nodes)
+            _start_thrice(act, 3)
             act.check(0, self._stage.reference)
 
     def _blind(self) -> None:
-        folder = self._stage.folder / "ray-blind"
+        folder = self._folder("blind")
         folder.mkdir()
-        with running(_ray_nodes("blind", blind_to=folder)) as nodes:
+        with running(self._nodes("blind", blind_to=folder)) as nodes:
             act = self._sweep("blind", nodes, 2 * _FEW)
             code, printed = act.fly()
             act.check(code, self._stage.reference)
             errors = act.errors()
             assert errors, printed
             assert all("127.0.0.2" in error["host"] for error in errors), errors
+
+    def _folder(self, name: str) -> Path:
+        """Returns where the runs of an act go."""
+        return self._stage.folder / f"ray-{name}"
+
+    def _nodes(self, name: str, blind_to: Path | None = None) -> RayNodes:
+        """Returns the cluster of an act."""
+        variables = {HOLD: str(hold_of(self._folder(name)))}
+        return RayNodes(self._stage.folder / f"r-{name}", blind_to, variables)
 
     def _check_finished(self, act: Sweep, code: int, printed: str) -> None:
         assert code == 0, printed
@@ -247,7 +256,7 @@ class RayActs:
     ) -> Sweep:
         address = f"hydra.launcher.ray.init.address={nodes.address}"
         return Sweep(
-            folder=self._stage.folder / f"ray-{name}",
+            folder=self._folder(name),
             runs=runs,
             kinds=["Slow"],
             launcher=["launcher=ray", address, *words],
@@ -255,33 +264,43 @@ class RayActs:
         )
 
 
-def _ray_nodes(name: str, slow: float = 0.0, blind_to: Path | None = None) -> RayNodes:
-    """Returns a cluster on which a step takes ``slow`` seconds."""
-    folder = Path(tempfile.gettempdir()) / f"gpmpc-ray-{name}"
-    return RayNodes(folder, blind_to, {SLOW: str(slow)})
-
-
 def _fly_through(act: Sweep, count: int, disturb: Act) -> tuple[int, str]:
     """Flies a sweep, and disturbs it while ``count`` of its runs fly."""
+    act.hold.touch()
     process = act.start()
     act.wait_for(count, RunState.RUNNING)
     disturb()
+    act.hold.unlink()
     return end_of(process)
 
 
 def _kill_and_repeat(act: Sweep, count: int) -> tuple[int, str]:
     """Kills a sweep while ``count`` of its runs fly, and flies it again."""
+    act.hold.touch()
     process = act.start()
     act.wait_for(count, RunState.RUNNING)
     process.kill()
     process.communicate()
-    return act.fly()
+    return end_of(_start_beside(act))
 
 
-def _start_twice(act: Sweep) -> None:
-    """Flies a sweep by two commands at once; both are to end well."""
-    ends = [end_of(process) for process in [act.start(), act.start()]]
-    assert [code for code, _ in ends] == [0, 0], ends
+def _start_thrice(act: Sweep, count: int) -> None:
+    """Flies a sweep by two commands at once, and a third one; all are to end well."""
+    act.hold.touch()
+    processes = [act.start(), act.start()]
+    act.wait_for(count, RunState.RUNNING)
+    processes.append(_start_beside(act))
+    ends = [end_of(process) for process in processes]
+    assert [code for code, _ in ends] == [0, 0, 0], ends
+
+
+def _start_beside(act: Sweep) -> subprocess.Popen:
+    """Starts a command while runs are held, and lets them go when it has seen them."""
+    began = time.time()
+    process = act.start()
+    act.wait_until_planned(since=began)
+    act.hold.unlink()
+    return process
 
 
 def run(acts: Mapping[str, Act], where: str) -> list[tuple[str, str, str, float]]:

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Protocol, TypeVar
 
-_PATIENCE = 120.0  # until a daemon answers [s]
+_PATIENCE = 300.0  # until a daemon answers, on a machine with other work [s]
 
 
 class Cluster(Protocol):
@@ -87,6 +87,15 @@ def processes_with(variable: str) -> list[int]:
         if variable.encode() in variables:
             processes.append(int(path.name))
     return processes
+
+
+def command_of(process: int) -> str:
+    """Returns the beginning of a process's command; empty where it has ended."""
+    try:
+        words = Path(f"/proc/{process}/cmdline").read_bytes().split(b"\0")
+    except OSError:
+        return ""
+    return b" ".join(words).decode(errors="replace")[:80]
 
 
 def kill(processes: Iterable[int]) -> None:

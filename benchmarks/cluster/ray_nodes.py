@@ -1,10 +1,8 @@
 """Starts a real cluster of Ray of two nodes on this machine, and stops it again."""
 
 import os
-import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -33,7 +31,7 @@ class RayNodes:
     """A cluster of two raylets.
 
     Args:
-        folder: Where it keeps everything; short, since it names sockets.
+        folder: Where it keeps everything; its path is short, since sockets lie there.
         blind_to: A folder that the second node does not see.
         variables: Of the environment of all tasks.
     """
@@ -101,5 +99,3 @@ class RayNodes:
         for name in reversed(_NAMES):
             if name in self._daemons:
                 self.kill_node(name)
-        time.sleep(1.0)
-        shutil.rmtree(self.folder, ignore_errors=True)

@@ -1,24 +1,30 @@
-"""Disturbances that change no number, and take time or memory: for acts of clusters."""
+"""Disturbances that change no number, and wait or take memory, for acts of clusters."""
 
 import os
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from gpmpc.systems import System
 
-SLOW = "GPMPC_SLOW"  # variable: seconds that every step takes
+HOLD = "GPMPC_HOLD"  # variable: a file; while it is there, no step ends
 _JOB = "SLURM_JOB_ID"  # variable that Slurm sets in a job
 
 
 @dataclass(frozen=True)
 class Slow:
-    """Takes as long as the environment says, each step."""
+    """Waits at each step while a file is there, which the environment names.
+
+    (That of the driver names none: it looks at the disturbances, too.)
+    """
 
     def disturb_plant(self, plant: System, time_of_step: float) -> System:
         """Returns the plant, later."""
-        time.sleep(float(os.environ.get(SLOW, "0")))
+        hold = os.environ.get(HOLD)
+        while hold and Path(hold).exists():
+            time.sleep(0.1)
         return plant
 
     def disturb_measurement(self, state: np.ndarray, time_of_step: float) -> np.ndarray:

@@ -29,7 +29,7 @@ NODES = ("n1", "n2")
 NEEDED = ("slurmctld", "slurmd", "munged", "sbatch", "squeue", "scontrol")
 FOR_ACCOUNTING = ("slurmdbd", "mariadbd", "mariadb-install-db", "sacct")
 _NODE_MARK = "GPMPC_NODE"  # variable of the daemons of a node, and of what they start
-_PATIENCE = 60.0  # until a daemon answers [s]
+_PATIENCE = 120.0  # until a command of Slurm answers, or a daemon ends [s]
 _PATH = os.pathsep.join([os.environ["PATH"], "/usr/sbin", "/sbin"])
 
 _CONFIGURATION = """
@@ -56,7 +56,8 @@ SelectTypeParameters=CR_CPU_Memory
 JobAcctGatherType=jobacct_gather/linux
 JobAcctGatherFrequency=1
 JobAcctGatherParams=OverMemoryKill
-SlurmdTimeout=10
+SlurmdTimeout=20
+MessageTimeout=30
 KillWait=2
 ReturnToService=2
 MaxArraySize=51
@@ -160,6 +161,10 @@ class Slurm:
         command = without_folder(blind_to, ["slurmd", "-D", "-N", name])
         self._start(name, command, {_NODE_MARK: name})
 
+    def wait_until_down(self, name: str) -> None:
+        """Waits until the controller has noticed that a node is gone."""
+        wait_for(f"{name} down", lambda: self._state_of(name).startswith("down"))
+
     def wait_until_idle(self) -> None:
         """Waits until all nodes are there, without a job."""
         wait_for("two idle nodes", self._is_ready)
@@ -261,8 +266,12 @@ class Slurm:
         return self._run("sacctmgr", "--noheader", "list", "cluster").returncode == 0
 
     def _is_ready(self) -> bool:
-        listed = self._run("sinfo", "--noheader", "--Node", "--format=%T").stdout
-        return listed.split().count("idle") == len(NODES)
+        return all(self._state_of(name) == "idle" for name in NODES)
+
+    def _state_of(self, name: str) -> str:
+        """Returns the state of a node as Slurm writes it; empty if it is silent."""
+        command = ["sinfo", "--noheader", "--Node", f"--nodes={name}", "--format=%T"]
+        return self._run(*command).stdout.strip()
 
     def _start(
         self, name: str, command: Sequence[str], marks: Mapping[str, str] | None = None

@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -11,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.cluster.processes import processes_with, wait_for
-from benchmarks.cluster.slow import SLOW
 from gpmpc.studies._run_folder import RunFolder, RunState
 
 ROOT = Path(__file__).resolve().parents[2]
-STAGE = "GPMPC_STAGE"  # variable: the folder of all acts that a process belongs to
 _MARK = "GPMPC_ACT"  # variable: the act that it belongs to
-_PATIENCE = 600.0  # for a sweep [s]
+_PATIENCE = 3600.0  # for a sweep: it ends long before, unless it hangs [s]
+_END = 120.0  # within which the processes of a sweep that has ended are gone [s]
 _WORDS = [
     "system=double_integrator", "steps=2", "data.samples=25", "model.restarts=0",
     "horizon=3", "recorder=none",
@@ -31,6 +29,11 @@ def disturbed(*kinds: str) -> str:
     return f"disturbances={','.join(lists)}"
 
 
+def hold_of(folder: Path) -> Path:
+    """Returns the file that holds the runs of a sweep's folder while it is there."""
+    return folder.with_name(f"{folder.name}.hold")
+
+
 @dataclass
 class Sweep:
     """One sweep that an act flies, in a folder of its own.
@@ -41,7 +44,6 @@ class Sweep:
         kinds: Of disturbances.
         launcher: Settings of the launcher.
         environment: In which the launcher finds its cluster.
-        slow: Seconds that a step takes.
     """
 
     folder: Path
@@ -49,7 +51,11 @@ class Sweep:
     kinds: Sequence[str]
     launcher: Sequence[str]
     environment: Mapping[str, str]
-    slow: float = 0.0
+
+    @property
+    def hold(self) -> Path:
+        """A file; while it is there, no step of a run ends."""
+        return hold_of(self.folder)
 
     def start(self, *words: str) -> subprocess.Popen:
         """Starts the command, as a user does."""
@@ -59,8 +65,6 @@ class Sweep:
         ]  # fmt: skip
         path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
         marks = {
-            SLOW: str(self.slow),
-            STAGE: str(self.folder.parent),
             _MARK: str(self.folder),
             "PYTHONPATH": path,
         }
@@ -90,6 +94,17 @@ class Sweep:
     def states(self) -> list[RunState]:
         """Returns how far the runs are."""
         return [folder.state for folder in self.folders()]
+
+    def wait_until_planned(self, since: float) -> None:
+        """Waits until a command has said what it asks for, and looks at the runs."""
+        wait_for(
+            f"another plan of {self.folder.name}",
+            lambda: any(
+                path.stat().st_mtime > since
+                for path in self.folder.glob("sweep-*.json")
+            ),
+            _PATIENCE,
+        )
 
     def wait_for(self, count: int, state: RunState) -> None:
         """Waits until so many runs are so far."""
@@ -138,12 +153,8 @@ class Sweep:
         wait_for(
             f"no process of {self.folder.name}",
             lambda: not processes_with(f"{_MARK}={self.folder}"),
-            60.0,
+            _END,
         )
-
-    def remove(self) -> None:
-        """Removes its folder."""
-        shutil.rmtree(self.folder)
 
 
 def end_of(process: subprocess.Popen) -> tuple[int, str]:

@@ -20,7 +20,6 @@ from omegaconf.errors import OmegaConfBaseException
 from gpmpc._compiling import report_compilation
 from gpmpc.cli._composing import ComposedSettings
 from gpmpc.cli._run import RunSettings, run_one
-from gpmpc.cli._terminal import collected_remarks
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.studies._run_folder import Busy, RunFolder
 
@@ -67,33 +66,28 @@ class Chunk:
         return [job.folder for job in self.jobs]
 
 
-def fly_chunk(chunk: Chunk) -> list[str]:
+def fly_chunk(chunk: Chunk) -> None:
     """Flies the runs of a chunk, in whichever process a launcher started.
 
     Those that another process works on are left to it.
-
-    Returns:
-        The warnings of all its runs, each text once.
 
     Raises:
         GpmpcError: Runs could not be begun, for reasons that their folders do not hold.
     """
     began = time.monotonic()
     problems: dict[str, None] = {}
-    with collected_remarks() as remarks:
-        for job in chunk.jobs:
-            try:
-                _fly_job(job)
-            except Busy:
-                continue
-            except (GpmpcError, OmegaConfBaseException) as error:
-                problems[" ".join(str(error).split())] = None
-            work = time.monotonic() - began
-            if chunk.most_work is not None and work > chunk.most_work:
-                break
+    for job in chunk.jobs:
+        try:
+            _fly_job(job)
+        except Busy:
+            continue
+        except (GpmpcError, OmegaConfBaseException) as error:
+            problems[" ".join(str(error).split())] = None
+        work = time.monotonic() - began
+        if chunk.most_work is not None and work > chunk.most_work:
+            break
     if problems:
         raise GpmpcError("; ".join(problems))
-    return remarks
 
 
 @report_compilation()

@@ -22,7 +22,6 @@ from typing import Any, Protocol
 
 from gpmpc._provenance import provenance
 from gpmpc.cli._launchers import Cause, Chunk, ChunkEnd, Launcher, Work
-from gpmpc.cli._terminal import print_error
 from gpmpc.studies._run_folder import Busy, RunFolder, RunState
 
 _LOOK_INTERVAL = 1.0  # between two looks at runs in other hands [s]
@@ -58,7 +57,6 @@ class Flying:
         chunked: Groups jobs into chunks.
         on_settled: Called once for every job, when it has finished or failed.
         retries: How often a run is flown again that was ended from outside.
-        on_remark: Called with what the user is to know of the flights, once a chunk.
     """
 
     launcher: Launcher
@@ -66,7 +64,6 @@ class Flying:
     chunked: Callable[[Sequence[Any]], Sequence[Chunk]]
     on_settled: OnSettled
     retries: int
-    on_remark: Callable[[str], object] = print_error
     #: runs that flew again in this call, since their process or node died; paths
     repeated: set[str] = field(default_factory=set)
     #: runs that were ended from outside before, and fly once more; paths
@@ -113,8 +110,6 @@ class Flying:
         adopted = {id(chunk) for chunk in running}
         unseen: list[tuple[Job, ChunkEnd]] = []
         for end in ends:
-            for remark in end.remarks:
-                self.on_remark(remark)
             if id(end.chunk) in adopted:
                 # It may have failed before this sweep looked.
                 self._failed_before |= dict.fromkeys(_paths(end.chunk))

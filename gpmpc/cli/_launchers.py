@@ -46,8 +46,8 @@ _CLASSES = {
     "slurm": ("_slurm", "Slurm"),
     "ray": ("_ray", "Ray"),
 }
-# Flies a chunk, and returns its remarks; of a module, so that it can be pickled.
-Work = Callable[[Any], Sequence[str]]
+# Flies a chunk; of a module, so that it can be pickled.
+Work = Callable[[Any], object]
 
 
 class Cause(Enum):
@@ -74,8 +74,6 @@ class ChunkEnd:
     cause: Cause | None = None
     #: the cause in a line
     reason: str = ""
-    #: what the user is to know of its flights
-    remarks: Sequence[str] = ()
 
 
 class Launcher(Protocol):
@@ -144,11 +142,11 @@ class Basic:
     def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
         for chunk in chunks:
             try:
-                remarks = work(chunk)
+                work(chunk)
             except Exception as error:
                 yield _end_by(error, chunk)
             else:
-                yield ChunkEnd(chunk, socket.gethostname(), remarks=remarks)
+                yield ChunkEnd(chunk, socket.gethostname())
 
     def close(self) -> None:
         pass
@@ -199,8 +197,7 @@ class Joblib:
                     if isinstance(error, Exception):
                         yield _end_by(error, chunk)
                     else:
-                        host = socket.gethostname()
-                        yield ChunkEnd(chunk, host, remarks=future.result())
+                        yield ChunkEnd(chunk, socket.gethostname())
         finally:
             for _, executor in flying.values():
                 executor.shutdown(wait=False, kill_workers=True)

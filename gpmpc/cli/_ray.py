@@ -90,7 +90,7 @@ class Ray:
     def _end(self, chunk: Chunk, task: Any) -> ChunkEnd:
         """Returns how a task ended."""
         try:
-            host, remarks = self._ray.get(task)
+            host = self._ray.get(task)
         except self._ray.exceptions.RayTaskError as error:
             cause = error.cause or error
             reason = f"{type(cause).__name__}: {' '.join(str(cause).split())}"
@@ -101,14 +101,14 @@ class Ray:
             message = f"Ray could not fly it: {' '.join(str(error).split())[:300]}"
             reason = f"{_REASONS.get(cause, message)} ({kind})"
             return ChunkEnd(chunk, "", cause, reason)
-        return ChunkEnd(chunk, host, remarks=remarks)
+        return ChunkEnd(chunk, host)
 
 
-def _fly(work: Work, chunk: Chunk, folder: str) -> tuple[str, Sequence[str]]:
-    """Flies a chunk on a node; returns the node's name and the chunk's remarks."""
+def _fly(work: Work, chunk: Chunk, folder: str) -> str:
+    """Flies a chunk on a node; returns the node's name."""
     if os.path.isdir(folder):  # where relative paths start, such as of a model's file
         os.chdir(folder)
     find_modules_here()
-    remarks = work(chunk)
+    work(chunk)
     address = import_module("ray").util.get_node_ip_address()
-    return f"{socket.gethostname()} ({address})", remarks
+    return f"{socket.gethostname()} ({address})"

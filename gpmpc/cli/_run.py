@@ -24,7 +24,7 @@ from gpmpc.cli._experiment import experiment_of, plain_settings
 from gpmpc.cli._mlflow import log_to_mlflow
 from gpmpc.cli._overrides import choices
 from gpmpc.cli._settings import folder_of, one_line, writing
-from gpmpc.cli._terminal import print_error
+from gpmpc.cli._terminal import print_error, remarks_to
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.recording import McapRecorder, RecordedSystem
 from gpmpc.studies._document import terminal
@@ -82,7 +82,11 @@ class Outcome:
 def run(config: DictConfig) -> Result:
     """Flies, prints the results and where they are kept."""
     console = Console()
-    with console.status("flying"), report_compilation():
+    with (
+        console.status("flying"),
+        report_compilation(),
+        remarks_to(print_error),
+    ):
         # What a user can get wrong is found before anything is written.
         experiment_of(config)
         words = choices(HydraConfig.get().overrides.task)
@@ -166,11 +170,15 @@ def run_one(run: RunSettings, wait: bool = True, warn: Warn | None = None) -> Ou
             return Outcome(folder.path, folder.result(settings), skipped=True)
         command = shlex.join(["gpmpc", "run", *run.choices])
         about = record(run.choices, settings, command)
+        remarks: list[str] = []
+        # All that are to come, too. Some are made once a process, so they are not of
+        # what equal runs share.
+        about["provenance"]["remarks"] = remarks
         try:
             text = OmegaConf.to_yaml(config, resolve=True)
             folder.begin(text)
             # The same sums in the same order, whatever the launcher.
-            with one_thread():
+            with one_thread(), remarks_to(remarks.append):
                 result = about | _fly(run, text, command, warn)
             folder.finish(result)
         except Exception as error:

@@ -71,7 +71,6 @@ _GIVEN_UP = (
 )
 # What ``_slurm_job`` prints.
 _OWN_ERROR = re.compile(r"^gpmpc: error: (.+)$", re.MULTILINE)
-_REMARK = re.compile(r"^gpmpc: remark: (.+)$", re.MULTILINE)
 
 
 class _Job(NamedTuple):
@@ -313,8 +312,7 @@ class Slurm:
         cause = _cause(job, log)
         host = job.host if job else _done_on(log or "")
         if cause is None:
-            remarks = _REMARK.findall(log or "")
-            return ChunkEnd(array.chunks[index], host, remarks=remarks)
+            return ChunkEnd(array.chunks[index], host)
         on_host = f" on {host}" if host else ""
         reason = self._reason(cause, job, log)
         number = job.number if job else f"{array.name}_{index}"

@@ -17,13 +17,11 @@ def main() -> None:
     try:
         find_modules_here()
         content = pickle.loads((Path(folder) / CHUNKS).read_bytes())
-        remarks = content["work"](pickle.loads(content["chunks"][int(index)]))
+        content["work"](pickle.loads(content["chunks"][int(index)]))
     except Exception as error:
         traceback.print_exc()
         print_error(f"error: {type(error).__name__}: {' '.join(str(error).split())}")
         sys.exit(1)
-    for remark in remarks:
-        print_error(f"remark: {remark}")
     print(f"{DONE}{socket.gethostname()}", file=sys.stderr)
 
 

@@ -169,23 +169,24 @@ class Sweep:
             chunked=self._chunking.chunks,
             on_settled=settle,
             retries=self.config.retries,
-            on_remark=self._print_remark,
         )
         flying.fly(job.with_absolute_path() for job in jobs if not job.folder.finished)
         self.flown_again |= {*flying.tried_again, *flying.repeated}
         self.given_up |= flying.given_up
         return outcomes
 
-    def _print_remark(self, remark: str) -> None:
+    def _print_remarks(self, remarks: Sequence[str]) -> None:
         """Prints what a flight has to say, once for all that differ in numbers."""
-        kind = without_numbers(remark)
-        if kind not in self._remarks:
-            self._remarks.add(kind)
-            print_error(remark)
+        for remark in remarks:
+            kind = without_numbers(remark)
+            if kind not in self._remarks:
+                self._remarks.add(kind)
+                print_error(remark)
 
     def _outcome(self, job: Job, state: RunState) -> JobOutcome:
         """Reads how a run ended, for the index, too; its warning is noted."""
         folder = self.tree / job.folder.path.name
+        self._print_remarks(job.folder.remarks())
         if state is RunState.FAILED:
             return JobOutcome(str(folder), job.folder.error())
         result = job.folder.result()

@@ -131,28 +131,34 @@ def logging_console() -> "Console":
 
 
 class _Remarks(logging.Handler):
-    """Keeps warnings, each text once."""
+    """Hands warnings on, each text once.
 
-    def __init__(self):
+    Args:
+        receive: Called with a text in one line.
+    """
+
+    def __init__(self, receive: Callable[[str], object]):
         super().__init__(logging.WARNING)
-        self.texts: list[str] = []
+        self._receive = receive
+        self._received: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
         text = " ".join(record.getMessage().split())
-        if text not in self.texts:
-            self.texts.append(text)
+        if text not in self._received:
+            self._received.add(text)
+            self._receive(text)
 
 
 @contextmanager
-def collected_remarks() -> Iterator[list[str]]:
-    """Keeps the package's warnings from the screen; yields the list they go to."""
+def remarks_to(receive: Callable[[str], object]) -> Iterator[None]:
+    """Hands the package's warnings on, each text once, instead of showing them."""
     log = logging.getLogger("gpmpc")
-    remarks = _Remarks()
+    remarks = _Remarks(receive)
     propagate = log.propagate
     log.addHandler(remarks)
     log.propagate = False
     try:
-        yield remarks.texts
+        yield
     finally:
         log.propagate = propagate
         log.removeHandler(remarks)

@@ -243,6 +243,16 @@ class RunFolder:
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             return f"{ERROR} cannot be read: {type(error).__name__}: {error}"
 
+    def remarks(self) -> list[str]:
+        """Returns the warnings of the flight that ended the run; none if unknown."""
+        name = METRICS if self.finished else ERROR
+        try:
+            content = json.loads((self.path / name).read_text(encoding="utf-8"))
+            remarks = content["provenance"]["remarks"]
+            return [" ".join(remark.split()) for remark in remarks]
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            return []
+
     def result(self, settings: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Reads the result of the finished run.
 

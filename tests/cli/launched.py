@@ -49,7 +49,6 @@ def fly(chunk):
                     fly_one(job)
         except Busy:
             continue
-    return []
 
 
 def fly_one(job):

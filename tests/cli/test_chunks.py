@@ -6,14 +6,14 @@ import os
 import hydra
 import pytest
 
-from gpmpc.cli import _chunks
+from gpmpc.cli import _chunks, _run
 from gpmpc.cli._chunks import Chunk, Chunking, Job, fly_chunk
 from gpmpc.cli._composing import Composer
 from gpmpc.cli._examples import Examples
 from gpmpc.cli._overrides import choices, combinations
 from gpmpc.cli._settings import settings
-from gpmpc.exceptions import GpmpcError, SettingError
-from gpmpc.studies._run_folder import Busy, RunFolder, folder_name
+from gpmpc.exceptions import DataError, GpmpcError, SettingError
+from gpmpc.studies._run_folder import Busy, RunFolder, RunState, folder_name
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -114,18 +114,29 @@ def test_a_chunk_goes_on_behind_what_cannot_be_flown(tmp_path, monkeypatch):
     assert flown == [0]  # it always flies one
 
 
-def test_a_chunk_returns_its_remarks_and_prints_none(tmp_path, monkeypatch, capfd):
+def test_remarks_stay_with_a_run_whatever_becomes_of_its_chunk(
+    tmp_path, monkeypatch, capfd
+):
     jobs = jobs_of(tmp_path, "seed=range(3)")
     log = logging.getLogger("gpmpc.gp")
 
-    def run(settings, wait):
+    def flight(run, *_):
         log.info("trained")
-        log.warning("few rows")
-        log.warning("seed\n%d", settings.config.seed % 2)
+        for _ in range(2):
+            log.warning("few\nrows of %d", run.config.seed)
+        if run.config.seed == 1:
+            raise DataError("no rows")
+        if run.config.seed == 2:
+            raise SystemExit("as if the process died")
+        return {}
 
-    monkeypatch.setattr(_chunks, "run_one", run)
-    remarks = fly_chunk(Chunk(tuple(jobs), None))
-    assert remarks == ["few rows", "seed 0", "seed 1"]
+    monkeypatch.setattr(_run, "_fly", flight)
+    with pytest.raises(SystemExit):
+        fly_chunk(Chunk(tuple(jobs), None))
+    states = [job.folder.state for job in jobs]
+    assert states == [RunState.FINISHED, RunState.FAILED, RunState.LOST]
+    remarks = [job.folder.remarks() for job in jobs]
+    assert remarks == [["few rows of 0"], ["few rows of 1"], []]
     assert capfd.readouterr() == ("", "")
     assert logging.getLogger("gpmpc").handlers == []
 

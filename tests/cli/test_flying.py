@@ -17,20 +17,6 @@ from gpmpc.studies._run_folder import RunFolder, RunState
 from tests.cli.launched import Chunk, fly, in_chunks, jobs_of
 
 
-def test_the_remarks_of_every_chunk_are_passed_on(tmp_path):
-    remarks = []
-    jobs = jobs_of(tmp_path, "flies", "flies")
-    Flying(
-        launcher=Basic(tmp_path),
-        work=lambda chunk: [*fly(chunk), "few rows"],
-        chunked=in_chunks(1),
-        on_settled=lambda job, state: None,
-        retries=0,
-        on_remark=remarks.append,
-    ).fly(jobs)
-    assert remarks == 2 * ["few rows"]
-
-
 class Told(Basic):
     """A launcher that says of every chunk what the test wants."""
 

@@ -238,23 +238,6 @@ def test_a_job_flies_its_chunk_and_says_so(fake, tree):
     assert job.folder.finished
 
 
-def fly_with_remark(chunk):
-    return [*fly(chunk), "few rows"]
-
-
-def test_the_remarks_of_a_job_come_from_its_log(fake, tree):
-    (chunk,) = in_chunks(1)(jobs_of(tree, "flies"))
-    launcher = Slurm(tree)
-    ends = launcher.launch(fly_with_remark, [chunk])
-    done = run_job(fake)
-    assert done.stderr.startswith("gpmpc: remark: few rows\ngpmpc: done on ")
-    (array,) = (tree / ".slurm").glob("gpmpc-*")
-    (array / "0.log").write_text(done.stderr)
-    (fake / "queue").write_text("0|COMPLETED|None|n1\n")
-    (end,) = ends
-    assert (end.cause, end.remarks) == (None, ["few rows"])
-
-
 def test_the_jobs_of_a_killed_sweep_are_watched_and_not_flown_twice(fake, tree):
     jobs = jobs_of(tree, "flies", "flies", "flies")
     killed = Slurm(tree)
