@@ -18,8 +18,14 @@ from gpmpc.cli._commands import Result
 from gpmpc.cli._recorded import errors_of_settings, experiment_of_run, recordings
 from gpmpc.cli._settings import writing
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.export import CompiledLoop, Question, export_c, write_replay
-from gpmpc.mpc import GPMPC, ControlLoop, Reference
+from gpmpc.export import (
+    CompiledLoop,
+    Question,
+    answers,
+    export_c,
+    write_replay,
+)
+from gpmpc.mpc import GPMPC, Reference
 from gpmpc.recording import Run, read_run
 from gpmpc.studies.flight import Experiment
 from gpmpc.studies.study import one_thread
@@ -102,17 +108,15 @@ def _measure(
     controller: GPMPC, questions: list[Question], precision: Any, policy: Any
 ) -> dict[str, Any]:
     """Returns memory and times of the compiled code, and how it differs."""
-    python = ControlLoop(controller, policy)
     compiled = CompiledLoop(controller, precision, policy)
     differences = []
     other_statuses = 0
     seconds = []
-    for measured, reference in questions:
-        expected = python.input(measured, reference)
-        input = compiled.input(measured, reference)
-        assert python.last is not None  # it has decided
-        differences.append(float(np.abs(input - expected).max()))
-        other_statuses += compiled.status is not python.last.status
+    for answer in answers(controller, questions, policy):
+        question = answer.question
+        input = compiled.input(question.measured, question.reference)
+        differences.append(float(np.abs(input - answer.input).max()))
+        other_statuses += compiled.status is not answer.status
         seconds.append(compiled.seconds)
     return {
         "memory_bytes": compiled.memory_bytes,

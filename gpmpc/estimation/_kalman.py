@@ -148,6 +148,13 @@ class Measurement(TensorModel):
         """Number of measured values, p."""
         return len(self.noise_covariance)
 
+    @property
+    def measured_states(self) -> tuple[int, ...] | None:
+        """Indices of the states that are measured; None of another function."""
+        if isinstance(self.function, _Selection):
+            return tuple(self.function.states)
+        return None
+
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
         """Predicts the measurement (*batch, p) at a certain state, without noise."""
         check_query(self, state, state[..., :0] if input is None else input)
@@ -487,12 +494,14 @@ class LateMeasurements:
         return self.belief
 
 
-def _measured_names(measurement: Any, state_names: Sequence[str]) -> tuple[str, ...]:
+def _measured_names(
+    measurement: Measurement, state_names: Sequence[str]
+) -> tuple[str, ...]:
     """Returns the names of y where it is some of the states; none otherwise."""
-    function = getattr(measurement, "function", None)
-    if not state_names or not isinstance(function, _Selection):
+    states = measurement.measured_states
+    if not state_names or states is None:
         return ()
-    return tuple(state_names[i] for i in function.states)
+    return tuple(state_names[i] for i in states)
 
 
 def _like(belief: Gaussian, key: str, value: Any, names: Sequence[str]) -> Tensor:

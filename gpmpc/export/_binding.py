@@ -11,15 +11,18 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+import torch
 
-from gpmpc._dynamics import DynamicsModel
+from gpmpc._dynamics import DynamicsModel, to_array
 from gpmpc.exceptions import SettingError
-from gpmpc.export._functions import FunctionWriter
+from gpmpc.export._c_types import fields_type, reference_type
+from gpmpc.export._filter import Estimator
+from gpmpc.export._functions import FunctionWriter, parameter_rows
 from gpmpc.export._text import Numbers
 from gpmpc.export._write import Precision, write_code
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import GPMPC, Decision, PredictionSettings, Problem, Reference, Timing
-from gpmpc.mpc._controller import read_parameters, read_reference
+from gpmpc.mpc._controller import read_reference
 from gpmpc.propagation import Propagator
 from gpmpc.qp import QPSolution, QPSolver
 from gpmpc.qp import _record as layout
@@ -42,6 +45,20 @@ class CompiledDecision(Decision):
     memory: Any = None
 
 
+class ControllerStruct:
+    """One ``gpmpc_controller`` of C.
+
+    Attributes:
+        fields: What it keeps from step to step, as a view of its memory.
+        size: Bytes.
+    """
+
+    def __init__(self, size: int, fields_type: Any):
+        self._memory = ctypes.create_string_buffer(size)
+        self.fields = fields_type.from_buffer(self._memory)
+        self.size = size
+
+
 class CompiledLibrary:
     """The exported C of a controller, compiled for this machine.
 
@@ -50,6 +67,7 @@ class CompiledLibrary:
         precision: Of all numbers, ``"double"`` or ``"float"``.
         on_failure: See ``export_c``.
         compiler: A C compiler, with options.
+        estimator: See ``export_c``.
 
     Raises:
         SettingError: The controller cannot be exported, or there is no compiler.
@@ -61,40 +79,45 @@ class CompiledLibrary:
         precision: Precision = "double",
         on_failure: str = "previous_plan",
         compiler: Sequence[str] = COMPILER,
+        estimator: Estimator | None = None,
     ):
         if shutil.which(compiler[0]) is None:
             rule = "must be a C compiler that is installed, such as gcc"
             raise SettingError("compiler", f"{rule}; got {compiler[0]!r}")
-        self.number = ctypes.c_double if precision == "double" else ctypes.c_float
-        self.dtype = np.dtype(self.number)
+        number = ctypes.c_double if precision == "double" else ctypes.c_float
+        self.dtype = np.dtype(number)
+        self._inputs = controller.prediction.input_dim
+        self._horizon = controller.horizon
         with tempfile.TemporaryDirectory() as folder:
-            export = write_code(controller, Path(folder), precision, on_failure)
+            export = write_code(
+                controller, Path(folder), precision, on_failure, estimator
+            )
             library = Path(folder) / "gpmpc.so"
             command = [*compiler, "-std=c99", "-shared", "-fPIC"]
             _compile([*command, "-o", str(library), str(export.source), "-lm"])
-            self.code = ctypes.CDLL(str(library))
-        self.code.gpmpc_memory.restype = ctypes.c_ulong
-        self.Kept = _kept_type(controller, self.number)
-        self.ReferenceType = _reference_type(controller, self.number)
+            self._code = ctypes.CDLL(str(library))
+        self._code.gpmpc_memory.restype = ctypes.c_ulong
+        self._fields_type = fields_type(controller, number, estimator is not None)
+        self._parameters = FunctionWriter(controller, Numbers("double")).parameters
+        self._reference_type = reference_type(controller, number, self._parameters)
 
-    def new_memory(self) -> ctypes.Array:
-        """Returns the memory of a controller before its first step."""
-        memory = ctypes.create_string_buffer(self.code.gpmpc_memory())
-        self.code.gpmpc_reset(memory)
-        return memory
+    def new_controller(self) -> ControllerStruct:
+        """Returns a controller before its first step."""
+        controller = ControllerStruct(self._code.gpmpc_memory(), self._fields_type)
+        self.reset(controller)
+        return controller
 
-    def kept(self, memory: ctypes.Array) -> Any:
-        """Returns what a memory keeps from step to step, as a view of it."""
-        return self.Kept.from_buffer(memory)
+    def reset(self, controller: ControllerStruct) -> None:
+        """Makes the next step of a controller a first one."""
+        self._code.gpmpc_reset(ctypes.byref(controller.fields))
 
-    def reference(
-        self, reference: Reference, horizon: int, parameters: Any = None
-    ) -> Any:
+    def reference(self, reference: Reference, parameters: Any = None) -> Any:
         """Returns a reference, and parameters, as the code takes them."""
-        followed = reference.over(horizon)
-        converted = self.ReferenceType()
-        if parameters is not None:
-            view(converted.parameters)[:] = read_parameters(parameters, horizon)
+        followed = reference.over(self._horizon)
+        converted = self._reference_type()
+        if self._parameters:
+            rows = parameter_rows(parameters, self._horizon, self._parameters)
+            view(converted.parameters)[:] = rows
         view(converted.states)[:] = followed.states
         if followed.inputs is not None:
             view(converted.inputs)[:] = followed.inputs
@@ -102,20 +125,33 @@ class CompiledLibrary:
         return converted
 
     def step(
-        self, memory: ctypes.Array, belief: Gaussian, reference: Any, inputs: int
+        self, controller: ControllerStruct, measured: Any, reference: Any
     ) -> Array:
-        """Decides the input (m,) of a time step."""
-        mean = np.ascontiguousarray(belief.mean, dtype=self.dtype)
-        covariance = np.ascontiguousarray(belief.covariance, dtype=self.dtype)
-        input = np.empty(inputs, dtype=self.dtype)
-        self.code.gpmpc_step_belief(
-            memory,
-            mean.ctypes.data_as(ctypes.c_void_p),
-            covariance.ctypes.data_as(ctypes.c_void_p),
+        """Decides the input (m,) of a time step.
+
+        Args:
+            controller: Of this library.
+            measured: What ``gpmpc_step`` takes; a ``Gaussian`` is a belief.
+            reference: See ``reference``.
+        """
+        input = np.empty(self._inputs, dtype=self.dtype)
+        step = self._code.gpmpc_step
+        numbers = [measured]
+        if isinstance(measured, Gaussian):
+            step = self._code.gpmpc_step_belief
+            numbers = [to_array(measured.mean), to_array(measured.covariance)]
+        arrays = [np.ascontiguousarray(part, dtype=self.dtype) for part in numbers]
+        step(
+            ctypes.byref(controller.fields),
+            *(_address(array) for array in arrays),
             ctypes.byref(reference),
-            input.ctypes.data_as(ctypes.c_void_p),
+            _address(input),
         )
         return input.astype(float)
+
+
+def _address(array: Array) -> ctypes.c_void_p:
+    return array.ctypes.data_as(ctypes.c_void_p)
 
 
 class CompiledController:
@@ -138,6 +174,7 @@ class CompiledController:
     ):
         self._controller = controller
         self._library = CompiledLibrary(controller, precision, compiler=compiler)
+        self._struct = self._library.new_controller()
         self.horizon = controller.horizon
         self.problem = controller.problem
         self.initial_input = controller.initial_input
@@ -155,32 +192,16 @@ class CompiledController:
         parameters: Any = None,
     ) -> Decision:
         """Decides the input for one step; see ``GPMPC.control``."""
-        began = perf_counter()
         library = self._library
-        memory = library.new_memory()
-        kept = library.kept(memory)
+        fields = self._struct.fields
+        library.reset(self._struct)
         if previous is not None:
-            self._continue(kept, previous)
-        converted = library.reference(reference, self.horizon, parameters)
-        input = library.step(memory, belief, converted, len(self.initial_input))
+            _continue(fields, previous)
+        followed = library.reference(reference, parameters)
+        began = perf_counter()
+        input = library.step(self._struct, belief, followed)
         timing = Timing(solve=perf_counter() - began)
-        return _decision(kept, input, timing)
-
-    def _continue(self, kept: Any, previous: Decision) -> None:
-        """Writes the last decision to what the code keeps."""
-        memory = getattr(previous, "memory", None)
-        if memory is not None:
-            ctypes.memmove(ctypes.byref(kept), memory, ctypes.sizeof(kept))
-        elif previous.solution is not None:
-            _write_solution(kept.solution, previous.solution)
-        view(kept.input)[:] = previous.input
-        if previous.disturbance is not None:
-            view(kept.disturbance)[:] = previous.disturbance
-        kept.has_input = int(np.isfinite(previous.input).all())
-        kept.has_plan = int(previous.applicable)
-        if previous.applicable:
-            view(kept.means)[:] = previous.means
-            view(kept.inputs)[:] = previous.inputs
+        return _decision(fields, input, timing)
 
 
 def compiled_controller(
@@ -218,6 +239,7 @@ class CompiledLoop:
         precision: Of all numbers.
         on_failure: ``"previous_plan"`` or ``"hold"``.
         compiler: A C compiler, with options.
+        estimator: A filter that is exported with the controller.
 
     Attributes:
         status: Of the last step.
@@ -232,31 +254,47 @@ class CompiledLoop:
         precision: Precision = "double",
         on_failure: str = "previous_plan",
         compiler: Sequence[str] = COMPILER,
+        estimator: Estimator | None = None,
     ):
-        self._controller = controller
-        self._library = CompiledLibrary(controller, precision, on_failure, compiler)
-        self._memory = self._library.new_memory()
-        self.memory_bytes = len(self._memory)
+        self._library = CompiledLibrary(
+            controller, precision, on_failure, compiler, estimator
+        )
+        self._filters = estimator is not None
+        self._struct = self._library.new_controller()
+        self.memory_bytes = self._struct.size
         self.status = Status.SOLVED
         self.failed = False
         self.seconds = 0.0
 
-    def input(self, state: Any, reference: Any, parameters: Any = None) -> Array:
-        """Returns the input to apply now (m,); see ``ControlLoop.input``."""
-        belief = state
-        if not isinstance(state, Gaussian):
-            belief = Gaussian.certain(np.asarray(state, dtype=float))
-        controller = self._controller
-        followed = self._library.reference(
-            read_reference(reference), controller.horizon, parameters
-        )
-        m = len(controller.initial_input)
+    @property
+    def belief(self) -> Gaussian:
+        """What the filter believed when the last step decided.
+
+        Raises:
+            SettingError: The controller was exported without a filter.
+        """
+        if not self._filters:
+            raise SettingError("estimator", "there is no belief without one")
+        mean = view(self._struct.fields.mean).astype(float)
+        covariance = view(self._struct.fields.covariance).astype(float)
+        return Gaussian(torch.from_numpy(mean), torch.from_numpy(covariance))
+
+    def input(self, measured: Any, reference: Any, parameters: Any = None) -> Array:
+        """Returns the input to apply now (m,); see ``ControlLoop.input``.
+
+        Args:
+            measured: The state (n,), with a filter what sensors show (p,), or a
+                ``Gaussian`` over the state.
+            reference: A set point (n,), states (H + 1, n), or a ``Reference``.
+            parameters: Of outputs and smooth constraints.
+        """
+        followed = self._library.reference(read_reference(reference), parameters)
         began = perf_counter()
-        input = self._library.step(self._memory, belief, followed, m)
+        input = self._library.step(self._struct, measured, followed)
         self.seconds = perf_counter() - began
-        kept = self._library.kept(self._memory)
-        self.status = _STATUSES[kept.status]
-        self.failed = bool(kept.failed)
+        fields = self._struct.fields
+        self.status = _STATUSES[fields.status]
+        self.failed = bool(fields.failed)
         return input
 
 
@@ -265,25 +303,42 @@ def view(numbers: Any) -> Array:
     return np.ctypeslib.as_array(numbers)
 
 
-def _write_solution(kept: Any, solution: QPSolution) -> None:
+def _continue(fields: Any, previous: Decision) -> None:
+    """Writes the last decision to what the code keeps."""
+    memory = getattr(previous, "memory", None)
+    if memory is not None:
+        ctypes.memmove(ctypes.byref(fields), memory, ctypes.sizeof(fields))
+    elif previous.solution is not None:
+        _write_solution(fields.solution, previous.solution)
+    view(fields.input)[:] = previous.input
+    if previous.disturbance is not None:
+        view(fields.disturbance)[:] = previous.disturbance
+    fields.has_input = int(np.isfinite(previous.input).all())
+    fields.has_plan = int(previous.applicable)
+    if previous.applicable:
+        view(fields.means)[:] = previous.means
+        view(fields.inputs)[:] = previous.inputs
+
+
+def _write_solution(target: Any, solution: QPSolution) -> None:
     """Writes the last program's solution in Python to what the code starts from."""
     n = len(solution.x)
     M = len(solution.caps)
     labels = layout.working_labels(solution.record, n, M)
-    kept.status = int(solution.record[layout.STATUS])
-    kept.rows = M - n
-    kept.working = len(labels)
-    view(kept.label)[: len(labels)] = labels
-    view(kept.multiplier)[:M] = solution.multipliers
-    view(kept.x)[:] = solution.x
+    target.status = int(solution.record[layout.STATUS])
+    target.rows = M - n
+    target.working = len(labels)
+    view(target.label)[: len(labels)] = labels
+    view(target.multiplier)[:M] = solution.multipliers
+    view(target.x)[:] = solution.x
 
 
-def _decision(kept: Any, input: Array, timing: Timing) -> Decision:
+def _decision(fields: Any, input: Array, timing: Timing) -> Decision:
     """Returns the decision that a step of the code ended with."""
-    failed = bool(kept.failed)
-    status = _STATUSES[kept.status]
-    means = view(kept.means).astype(float)
-    inputs = view(kept.inputs).astype(float)
+    failed = bool(fields.failed)
+    status = _STATUSES[fields.status]
+    means = view(fields.means).astype(float)
+    inputs = view(fields.inputs).astype(float)
     if failed:
         means = np.full_like(means, np.nan)
         inputs = np.tile(input, (len(inputs), 1))
@@ -296,66 +351,11 @@ def _decision(kept: Any, input: Array, timing: Timing) -> Decision:
         status=status,
         iterations=1,
         timing=timing,
-        disturbance=view(kept.disturbance).astype(float),
+        disturbance=view(fields.disturbance).astype(float),
         suboptimal=not (failed or status.solved),
-        violation=float(kept.violation),
-        memory=bytes(kept),
+        violation=float(fields.violation),
+        memory=bytes(fields),
     )
-
-
-def _kept_type(controller: GPMPC, number: Any) -> type[ctypes.Structure]:
-    """Returns the type of what ``gpmpc_controller`` begins with (``core.h``)."""
-    n = controller.prediction.state_dim
-    m = controller.prediction.input_dim
-    H = controller.horizon
-    rates = H * m if controller.problem.input_rates.finite else 0
-    rows = H * m + rates + H * controller.prediction.constraints.per_stage
-    constraints = H * m + rows
-
-    class Solution(ctypes.Structure):
-        _fields_ = (
-            ("status", ctypes.c_int),
-            ("iterations", ctypes.c_int),
-            ("rows", ctypes.c_int),
-            ("working", ctypes.c_int),
-            ("label", ctypes.c_int * constraints),
-            ("multiplier", number * constraints),
-            ("x", number * (H * m)),
-        )
-
-    class Kept(ctypes.Structure):
-        _fields_ = (
-            ("has_input", ctypes.c_int),
-            ("has_plan", ctypes.c_int),
-            ("input", number * m),
-            ("means", (number * n) * (H + 1)),
-            ("inputs", (number * m) * H),
-            ("disturbance", number * n),
-            ("solution", Solution),
-            ("status", ctypes.c_int),
-            ("failed", ctypes.c_int),
-            ("violation", number),
-        )
-
-    return Kept
-
-
-def _reference_type(controller: GPMPC, number: Any) -> type[ctypes.Structure]:
-    """Returns the type ``gpmpc_reference`` (``core.h``)."""
-    n = controller.prediction.state_dim
-    m = controller.prediction.input_dim
-    H = controller.horizon
-    parameters = FunctionWriter(controller, Numbers("double")).parameters
-
-    class ReferenceType(ctypes.Structure):
-        _fields_ = (
-            ("states", (number * n) * (H + 1)),
-            ("inputs", (number * m) * H),
-            ("has_inputs", ctypes.c_int),
-            ("parameters", (number * max(1, parameters)) * H),
-        )
-
-    return ReferenceType
 
 
 def _compile(command: Sequence[str]) -> None:
@@ -366,5 +366,6 @@ def _compile(command: Sequence[str]) -> None:
     """
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        reason = done.stderr.strip().partition("\n")[0]
+        lines = done.stderr.strip().splitlines() or ["without a word"]
+        reason = next((line for line in lines if "error" in line), lines[0])
         raise SettingError("compiler", f"{command[0]} failed: {reason}")

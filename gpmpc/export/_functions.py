@@ -3,11 +3,14 @@
 from collections.abc import Sequence
 from typing import Any
 
-from gpmpc.exceptions import SettingError
+import numpy as np
+
+from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.export._expressions import expansion_lines, graph_of_tape
 from gpmpc.export._text import Numbers, function
 from gpmpc.models import CasadiFunction
 from gpmpc.mpc import GPMPC, Inequality
+from gpmpc.mpc._controller import read_parameters
 from gpmpc.mpc._cost import by_stage
 
 
@@ -134,6 +137,26 @@ class FunctionWriter:
     def _function(self, signature: str, body: Sequence[str], note: str) -> None:
         """Writes a function, what it computes above it."""
         self._parts.append(function(signature, body, note))
+
+
+def parameter_rows(parameters: Any, horizon: int, count: int) -> np.ndarray:
+    """Returns parameters by stage (H, q) as the code takes them; None are zero.
+
+    Args:
+        parameters: (q,) or (H, q), or None.
+        horizon: H.
+        count: q of the controller.
+
+    Raises:
+        ShapeError: They are of another number.
+    """
+    if parameters is None:
+        return np.zeros((horizon, count))
+    rows = read_parameters(parameters, horizon)
+    if rows.shape != (horizon, count):
+        rule = f"the controller's functions take {count} parameters a stage"
+        raise ShapeError(f"{rule}; got {rows.shape}")
+    return rows
 
 
 def _square_lines(name: str, count: int) -> list[str]:

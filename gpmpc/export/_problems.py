@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gpmpc.export._filter import Estimator, filter_definitions
 from gpmpc.export._functions import FunctionWriter
 from gpmpc.export._text import Numbers, comment, integers
 from gpmpc.mpc import GPMPC
@@ -20,6 +21,8 @@ _FLOAT_PRICE = 1e3
 _COMMENTS = {
     "GPMPC_STATES": "n",
     "GPMPC_INPUTS": "m",
+    "GPMPC_FILTERS": "whether a step filters what it measures",
+    "GPMPC_MEASURED": "numbers that a step measures, p",
     "GPMPC_HORIZON": "H, the number of predicted states",
     "GPMPC_STAGES": "stage models: H, or one that is held",
     "GPMPC_ROWS": "rows of the states' constraints at a stage, r",
@@ -77,6 +80,7 @@ def definitions(
     functions: FunctionWriter,
     model_memory: int,
     on_failure: str,
+    estimator: Estimator | None = None,
 ) -> Definitions:
     """Returns the dimensions and settings of a controller."""
     prediction = controller.prediction
@@ -106,6 +110,7 @@ def definitions(
         "GPMPC_TOLERANCE": f"(gpmpc_real){tolerance!r}",
         "GPMPC_DISTURBANCE_GAIN": f"(gpmpc_real){float(gain)!r}",
     }
+    values |= filter_definitions(estimator, prediction.state_dim)
     flags = _flags(controller, numbers, on_failure)
     values |= {name: str(int(flag)) for name, flag in flags.items()}
     return Definitions(values, _COMMENTS)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 from gpmpc._files import write_whole
 from gpmpc.exceptions import check_choice
 from gpmpc.export._checks import check_exportable
+from gpmpc.export._filter import Estimator, FilterWriter, check_estimator
 from gpmpc.export._functions import FunctionWriter
 from gpmpc.export._models import ModelWriter
 from gpmpc.export._problems import definitions, rolls_out, tables, tightens
@@ -39,6 +40,7 @@ def export_c(
     path: str | Path,
     precision: Precision = "double",
     on_failure: str = "previous_plan",
+    estimator: Estimator | None = None,
 ) -> Export:
     """Writes a controller as C into a folder.
 
@@ -54,12 +56,14 @@ def export_c(
             taken in double in both.
         on_failure: What is applied where a step fails: ``"previous_plan"`` or
             ``"hold"``; see ``ControlLoop``.
+        estimator: A filter of which the code decides for the belief: a step is then
+            given what sensors show. Without one it is given the state.
 
     Raises:
-        SettingError: The controller has a part that C cannot hold; it is named.
+        SettingError: Controller or filter have a part that C cannot hold; it is named.
     """
     folder = Path(path)
-    export = write_code(controller, folder / "src", precision, on_failure)
+    export = write_code(controller, folder / "src", precision, on_failure, estimator)
     for place, name in _AROUND.items():
         (folder / place).parent.mkdir(parents=True, exist_ok=True)
         write_whole(folder / place, (_HERE / "around" / name).read_text())
@@ -67,27 +71,44 @@ def export_c(
 
 
 def write_code(
-    controller: GPMPC, folder: Path, precision: Precision, on_failure: str
+    controller: GPMPC,
+    folder: Path,
+    precision: Precision,
+    on_failure: str,
+    estimator: Estimator | None = None,
 ) -> Export:
     """Writes header and source alone; see ``export_c``."""
     check_choice("precision", precision, ("double", "float"))
     check_exportable(controller, on_failure)
-    header, source = _texts(controller, Numbers(precision), on_failure)
+    if estimator is not None:
+        check_estimator(controller, estimator)
+    header, source = _texts(controller, Numbers(precision), on_failure, estimator)
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / "gpmpc.h", header)
     write_whole(folder / "gpmpc.c", source)
     return Export(header=folder / "gpmpc.h", source=folder / "gpmpc.c")
 
 
-def _texts(controller: GPMPC, numbers: Numbers, on_failure: str) -> tuple[str, str]:
+def _texts(
+    controller: GPMPC,
+    numbers: Numbers,
+    on_failure: str,
+    estimator: Estimator | None,
+) -> tuple[str, str]:
     """Returns header and source."""
     functions = FunctionWriter(controller, numbers)
     prediction = controller.prediction
     means_alone = rolls_out(controller) or prediction.settings.disturbance_gain > 0
-    model = ModelWriter(numbers, tightens(controller), means_alone)
+    variances = tightens(controller) or estimator is not None
+    model = ModelWriter(numbers, variances, means_alone)
     model.write(prediction.model, "model")
-    settings = definitions(controller, numbers, functions, model.memory, on_failure)
-    names = _names(controller)
+    filter_tables = ""
+    if estimator is not None:
+        filter_tables = FilterWriter(controller, estimator, numbers, model).text
+    settings = definitions(
+        controller, numbers, functions, model.memory, on_failure, estimator
+    )
+    names = _names(controller, estimator)
     header = "\n".join(
         [
             _banner("A controller in C: its memory and its calls.", names),
@@ -105,10 +126,16 @@ def _texts(controller: GPMPC, numbers: Numbers, on_failure: str) -> tuple[str, s
     )
     gps = _part("gp.c") if model.memory else ""  # a known model has none
     generated = "\n".join(
-        [gps, model.text, tables(controller, numbers), functions.text]
+        [gps, model.text, filter_tables, tables(controller, numbers), functions.text]
     )
+    parts = {
+        "model": generated,
+        "qp": _part("qp.c"),
+        "filter": _part("filter.c") if estimator is not None else "",
+    }
     core = _part("core.c")
-    core = core.replace("/*{model}*/", generated).replace("/*{qp}*/", _part("qp.c"))
+    for name, text in parts.items():
+        core = core.replace(f"/*{{{name}}}*/", text)
     source = "\n".join(
         [
             _banner("A controller in C: tables, model, program and policy.", names),
@@ -132,14 +159,22 @@ def _part(name: str) -> str:
     return (_HERE / name).read_text()
 
 
-def _names(controller: GPMPC) -> list[str]:
-    """Returns the lines that name states and inputs."""
+def _names(controller: GPMPC, estimator: Estimator | None) -> list[str]:
+    """Returns the lines that name states, inputs and measurements."""
     prediction = controller.prediction
     signals = prediction.signals
     states = signals.state_names or [f"x{i}" for i in range(prediction.state_dim)]
     inputs = signals.input_names or [f"u{i}" for i in range(prediction.input_dim)]
     lines = [f"state {i}: {name}" for i, name in enumerate(states)]
     lines += [f"input {i}: {name}" for i, name in enumerate(inputs)]
+    if estimator is not None:
+        measurement = estimator.filter.measurement
+        measured = measurement.measured_states or range(measurement.output_dim)
+        for i, state in enumerate(measured):
+            name = f"y{i}"
+            if measurement.measured_states is not None:
+                name = states[state]
+            lines.append(f"measured {i}: {name}")
     if signals.time_step:
         lines.append(f"time step: {signals.time_step:g} s")
     return lines

@@ -407,12 +407,29 @@ static void write_gains(gpmpc_problem *problem)
 }
 #endif
 
+#if GPMPC_TUBES || GPMPC_FILTERS
+/* after <- A before A' + V, symmetric; ``after`` may be ``before`` */
+static void move_covariance(const real *A, const real *V, const real *before,
+                            real *after)
+{
+    real spread[GPMPC_STATES * GPMPC_STATES];
+    int i, j;
+    product(A, before, n, n, n, spread);
+    for (i = 0; i < n; i++)
+        for (j = 0; j <= i; j++) {
+            real total = (V[i * n + j] + V[j * n + i]) / 2;
+            total += dot(spread + i * n, A + j * n, n);
+            after[i * n + j] = total;
+            after[j * n + i] = total;
+        }
+}
+#endif
+
 #if GPMPC_TUBES
 /* Sigma_{k+1} = (A - B K) Sigma_k (A - B K)' + V */
 static void predict_covariances(gpmpc_problem *problem, const real *start)
 {
     real closed[GPMPC_STATES * GPMPC_STATES];
-    real spread[GPMPC_STATES * GPMPC_STATES];
     int k, i, j, l;
     copy(start, &problem->covariances[0][0][0], n * n);
     for (k = 0; k < H; k++) {
@@ -424,14 +441,9 @@ static void predict_covariances(gpmpc_problem *problem, const real *start)
                     closed[i * n + j] -=
                         problem->B[stage][i][l] * problem->gains[k][l][j];
             }
-        product(closed, &problem->covariances[k][0][0], n, n, n, spread);
-        for (i = 0; i < n; i++)
-            for (j = 0; j <= i; j++) {
-                real total = (problem->V[stage][i][j] + problem->V[stage][j][i]) / 2;
-                total += dot(spread + i * n, closed + j * n, n);
-                problem->covariances[k + 1][i][j] = total;
-                problem->covariances[k + 1][j][i] = total;
-            }
+        move_covariance(closed, &problem->V[stage][0][0],
+                        &problem->covariances[k][0][0],
+                        &problem->covariances[k + 1][0][0]);
     }
 }
 #endif
@@ -1292,6 +1304,7 @@ static int decide(gpmpc_controller *controller, const real *state,
     return status;
 }
 
+/*{filter}*/
 /* ------------------------------------------------------------------------------------
    The policy: what is applied, whatever happened (gpmpc/mpc/_policy.py).
    --------------------------------------------------------------------------------- */
@@ -1381,6 +1394,10 @@ void gpmpc_reset(gpmpc_controller *controller)
     controller->solution.working = 0;
     controller->solution.status = GPMPC_SOLVED;
     fill(controller->disturbance, 0, n);
+#if GPMPC_FILTERS
+    copy(first_mean, controller->belief.mean, n);
+    copy(first_covariance, controller->belief.covariance, n * n);
+#endif
 }
 
 void gpmpc_hold(gpmpc_reference *reference, const gpmpc_real state[GPMPC_STATES])
@@ -1420,11 +1437,20 @@ int gpmpc_step_belief(gpmpc_controller *controller, const gpmpc_real mean[GPMPC_
     return status;
 }
 
-int gpmpc_step(gpmpc_controller *controller, const gpmpc_real measured[GPMPC_STATES],
+int gpmpc_step(gpmpc_controller *controller,
+               const gpmpc_real measured[GPMPC_MEASURED],
                const gpmpc_reference *reference, gpmpc_real input[GPMPC_INPUTS])
 {
+#if GPMPC_FILTERS
+    if (controller->has_input)
+        predict_belief(controller);
+    update_belief(controller, measured);
+    return gpmpc_step_belief(controller, controller->belief.mean,
+                             controller->belief.covariance, reference, input);
+#else
     static const real certain[GPMPC_STATES * GPMPC_STATES] = {0};
     return gpmpc_step_belief(controller, measured, certain, reference, input);
+#endif
 }
 
 unsigned long gpmpc_memory(void) { return (unsigned long)sizeof(gpmpc_controller); }

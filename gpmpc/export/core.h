@@ -49,6 +49,14 @@ typedef struct {
     gpmpc_real parameters[GPMPC_HORIZON][GPMPC_AT_LEAST_ONE(GPMPC_PARAMETERS)];
 } gpmpc_reference;
 
+#if GPMPC_FILTERS
+/* What the filter knows of the state. */
+typedef struct {
+    gpmpc_real mean[GPMPC_STATES];
+    gpmpc_real covariance[GPMPC_STATES * GPMPC_STATES];
+} gpmpc_belief;
+#endif
+
 /* The solution of a quadratic program, from which the next one starts. */
 typedef struct {
     int status;
@@ -163,6 +171,9 @@ typedef struct {
     int status;
     int failed; /* whether the policy chose its input */
     gpmpc_real violation; /* by how much its plan misses a bound; NAN where it failed */
+#if GPMPC_FILTERS
+    gpmpc_belief belief; /* that the last step decided for */
+#endif
     /* memory of a step */
     gpmpc_problem problem;
     gpmpc_program program;
@@ -178,11 +189,16 @@ void gpmpc_reset(gpmpc_controller *controller);
 /* Makes a set point the reference of the whole horizon. */
 void gpmpc_hold(gpmpc_reference *reference, const gpmpc_real state[GPMPC_STATES]);
 
-/* Decides the input of a time step. The state counts as certain. */
-int gpmpc_step(gpmpc_controller *controller, const gpmpc_real measured[GPMPC_STATES],
+/* Decides the input of a time step. Without a filter what is measured is the state (n),
+   which counts as certain. With one (GPMPC_FILTERS) it is what sensors show: entries
+   that are not finite are missing, and the last step's input counts as applied; where
+   another one was, write it to controller.input before. */
+int gpmpc_step(gpmpc_controller *controller,
+               const gpmpc_real measured[GPMPC_MEASURED],
                const gpmpc_reference *reference, gpmpc_real input[GPMPC_INPUTS]);
 
-/* The same for a state of which a mean and a covariance are known. */
+/* The same for a state of which a mean and a covariance are known: no filter is
+   asked. */
 int gpmpc_step_belief(gpmpc_controller *controller, const gpmpc_real mean[GPMPC_STATES],
                       const gpmpc_real covariance[GPMPC_STATES * GPMPC_STATES],
                       const gpmpc_reference *reference,

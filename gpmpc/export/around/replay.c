@@ -3,8 +3,9 @@
 
      ./replay replay.txt
 
-   Every line of the file is a step: what was measured (n), the reference r_0 .. r_H
-   ((H + 1) n), its inputs (H m), the input that Python decided on (m), and the status.
+   Every line of the file is a step: what was measured (p), the reference r_0 .. r_H
+   ((H + 1) n), its inputs (H m), the parameters (H q), the input that Python decided on
+   (m), and the status.
    Prints the largest deviation, and how many statuses differ. */
 
 #include <math.h>
@@ -29,7 +30,7 @@ static int read_numbers(FILE *file, gpmpc_real *numbers, int count)
 
 int main(int count, char **arguments)
 {
-    gpmpc_real measured[GPMPC_STATES];
+    gpmpc_real measured[GPMPC_MEASURED];
     gpmpc_real expected[GPMPC_INPUTS];
     gpmpc_real input[GPMPC_INPUTS];
     double worst = 0;
@@ -43,12 +44,14 @@ int main(int count, char **arguments)
     }
     gpmpc_reset(&controller);
     reference.has_inputs = 1;
-    while (read_numbers(file, measured, GPMPC_STATES)) {
+    while (read_numbers(file, measured, GPMPC_MEASURED)) {
         int status, i;
         if (!read_numbers(file, &reference.states[0][0],
                           (GPMPC_HORIZON + 1) * GPMPC_STATES)
             || !read_numbers(file, &reference.inputs[0][0],
                              GPMPC_HORIZON * GPMPC_INPUTS)
+            || !read_numbers(file, &reference.parameters[0][0],
+                             GPMPC_HORIZON * GPMPC_PARAMETERS)
             || !read_numbers(file, expected, GPMPC_INPUTS)
             || fscanf(file, "%d", &expected_status) != 1) {
             fprintf(stderr, "step %d is not whole\n", steps);

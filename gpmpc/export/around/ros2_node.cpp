@@ -1,6 +1,7 @@
 // A ROS 2 node around the exported controller: written for rclcpp, compiled only where
-// ROS 2 is. It takes std_msgs/msg/Float64MultiArray on "state" (n numbers) and on
-// "reference" (n numbers, a set point), and publishes the same type on "input" (m).
+// ROS 2 is. It takes std_msgs/msg/Float64MultiArray on "measured" (p numbers: the
+// state, or with a filter what sensors show) and on "reference" (n numbers, a set
+// point), and publishes the same type on "input" (m).
 
 #include <rclcpp/rclcpp.hpp>
 #include <std_msgs/msg/float64_multi_array.hpp>
@@ -17,8 +18,8 @@ public:
         publisher_ = create_publisher<Numbers>("input", 1);
         references_ = create_subscription<Numbers>(
             "reference", 1, [this](const Numbers &message) { follow(message); });
-        states_ = create_subscription<Numbers>(
-            "state", 1, [this](const Numbers &message) { decide(message); });
+        measurements_ = create_subscription<Numbers>(
+            "measured", 1, [this](const Numbers &message) { decide(message); });
     }
 
 private:
@@ -37,13 +38,13 @@ private:
 
     void decide(const Numbers &message)
     {
-        if (!has_reference_ || message.data.size() != GPMPC_STATES)
+        if (!has_reference_ || message.data.size() != GPMPC_MEASURED)
             return;
-        gpmpc_real state[GPMPC_STATES];
+        gpmpc_real measured[GPMPC_MEASURED];
         gpmpc_real input[GPMPC_INPUTS];
-        for (int i = 0; i < GPMPC_STATES; i++)
-            state[i] = static_cast<gpmpc_real>(message.data[i]);
-        gpmpc_step(&controller_, state, &reference_, input);
+        for (int i = 0; i < GPMPC_MEASURED; i++)
+            measured[i] = static_cast<gpmpc_real>(message.data[i]);
+        gpmpc_step(&controller_, measured, &reference_, input);
         Numbers decided;
         decided.data.assign(input, input + GPMPC_INPUTS);
         publisher_->publish(decided);
@@ -54,7 +55,7 @@ private:
     bool has_reference_ = false;
     rclcpp::Publisher<Numbers>::SharedPtr publisher_;
     rclcpp::Subscription<Numbers>::SharedPtr references_;
-    rclcpp::Subscription<Numbers>::SharedPtr states_;
+    rclcpp::Subscription<Numbers>::SharedPtr measurements_;
 };
 
 int main(int count, char **arguments)
