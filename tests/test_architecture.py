@@ -49,12 +49,18 @@ def test_gp_modules_load_no_optimiser_settings_or_figures():
     assert loaded == "[]"
 
 
-def test_recordings_need_neither_torch_nor_compilers():
-    forbidden = ["torch", "numba", "scipy", "hydra", "matplotlib", "pandas"]
-    code = (
-        f"import sys, gpmpc.recording; print([m for m in {forbidden} if m in "
-        f"sys.modules])"
-    )
+@pytest.mark.parametrize(
+    ("modules", "forbidden"),
+    [
+        (
+            "gpmpc.recording",
+            ["torch", "numba", "scipy", "hydra", "matplotlib", "pandas"],
+        ),
+        ("gpmpc.cli._report, gpmpc.cli._status", ["torch", "numba", "casadi"]),
+    ],
+)
+def test_reading_runs_needs_neither_torch_nor_compilers(modules, forbidden):
+    code = f"import sys, {modules}; print([m for m in {forbidden} if m in sys.modules])"
     loaded = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     ).stdout.strip()

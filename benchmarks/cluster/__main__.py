@@ -1,12 +1,13 @@
-"""Real clusters of two nodes on this machine, and what must hold on them.
+"""Sweeps on this machine and on real clusters of two nodes, and what must hold there.
 
     make cluster                                        # all of it
     .venv/bin/python -m benchmarks.cluster --on slurm --only memory
 
-Starts Slurm without accounting, Slurm with it, and Ray, flies sweeps on each while it
-kills, cancels and hides, and prints a table. After every act each run is accounted for,
-has the numbers of the basic launcher, the exit code is true, and no process is left.
-It takes half an hour on two idle cores, and has patience where they are busy.
+Flies sweeps by joblib, then starts Slurm without accounting, Slurm with it, and Ray,
+and flies them on each, while it kills, cancels and hides; prints a table. After every
+act each run is accounted for, has the numbers of the basic launcher, the exit code is
+true, and no process is left. It takes half an hour on two idle cores, and has patience
+where they are busy.
 
 Slurm needs root and the packages slurmctld, slurmd, slurm-client and munge of Debian or
 Ubuntu, with accounting also slurmdbd and mariadb-server; Ray needs gpmpc[ray]. What is
@@ -30,11 +31,19 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from benchmarks.cluster import ray_nodes, slurm
-from benchmarks.cluster.acts import MANY, Act, RayActs, SlurmActs, Stage, run
+from benchmarks.cluster.acts import (
+    MANY,
+    Act,
+    JoblibActs,
+    RayActs,
+    SlurmActs,
+    Stage,
+    run,
+)
 from benchmarks.cluster.processes import command_of, kill, processes_with, running
 from benchmarks.cluster.sweeps import Sweep
 
-_CLUSTERS = ("slurm", "slurm-accounting", "ray")
+_CLUSTERS = ("joblib", "slurm", "slurm-accounting", "ray")
 _PREFIX = "gpmpc-acts-"  # of the folder of a call
 _STAGE = "GPMPC_STAGE"  # variable: that folder, in whatever the call started
 _ENDING = 60.0  # within which the processes of clusters that were stopped are gone [s]
@@ -133,6 +142,8 @@ def _reference(folder: Path, runs: int) -> dict[int, dict]:
 
 def _play(cluster: str, stage: Stage, only: str) -> list[tuple[str, str, str, float]]:
     """Starts a cluster, plays its acts and stops it."""
+    if cluster == "joblib":
+        return run(_chosen(JoblibActs(stage).by_name(), only), cluster)
     accounting = cluster == "slurm-accounting"
     missing = ray_nodes.missing() if cluster == "ray" else slurm.missing(accounting)
     if missing:

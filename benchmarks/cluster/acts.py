@@ -1,5 +1,6 @@
 """What clusters do to sweeps, one act after another; each raises where it fails."""
 
+import os
 import subprocess
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -7,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.cluster.processes import running
+from benchmarks.cluster.processes import kill, running
 from benchmarks.cluster.ray_nodes import RayNodes
 from benchmarks.cluster.slow import HOLD
 from benchmarks.cluster.slurm import Slurm
@@ -19,6 +20,8 @@ MANY = 200
 _FEW = 6
 _SHARED = ["chunk=25"]  # of the many: two rounds on two nodes of two processors
 _SLURM = ["launcher=slurm", "hydra.launcher.mem_gb=2"]
+_KILLS = 10  # of a driver on one machine, each at another moment
+_KILL_INTERVAL = 0.7  # between two of these moments [s]
 _WALL_TIME = 3  # which only a run that hangs reaches, on a busy machine, too [min]
 
 
@@ -179,6 +182,78 @@ class SlurmActs:
         """Returns the number of a job in a state."""
         rows = [row.split("|") for row in self._jobs(act).values()]
         return next(row[0] for row in rows if row[1] == state)
+
+
+class JoblibActs:
+    """What happens to sweeps in processes of one machine.
+
+    Args:
+        stage: Where the acts take place.
+    """
+
+    def __init__(self, stage: Stage):
+        self._stage = stage
+
+    def by_name(self) -> dict[str, Act]:
+        """Returns the acts, by what they show."""
+        return {
+            f"{MANY} runs in two processes": self._many,
+            "a process killed": self._process,
+            f"the driver killed, {_KILLS} times": self._driver,
+        }
+
+    def _many(self) -> None:
+        act = self._sweep("many", MANY, words=())
+        code, printed = act.fly()
+        assert code == 0, printed
+        act.check(code, self._stage.reference)
+
+    def _process(self) -> None:
+        act = self._sweep("process")
+        process = self._start_and_hold(act)
+        act.wait_for(2, RunState.RUNNING)
+        kill(act.workers()[:1])
+        act.hold.unlink()
+        code, printed = end_of(process)
+        assert code == 0, printed
+        assert "1 of the runs were flown again" in printed, printed
+        act.check(code, self._stage.reference)
+
+    def _driver(self) -> None:
+        act = self._sweep("driver")
+        for index in range(_KILLS):
+            process = self._start_and_hold(act)
+            # While processes start, import, begin runs and fly.
+            time.sleep(index * _KILL_INTERVAL)
+            if index == _KILLS - 1:
+                act.wait_for(2, RunState.RUNNING)
+            process.kill()
+            process.communicate()
+            act.wait_until_alone()
+            act.hold.unlink()
+        code, printed = act.fly()
+        assert code == 0, printed
+        act.check(code, self._stage.reference)
+
+    def _start_and_hold(self, act: Sweep) -> subprocess.Popen:
+        """Starts a command whose runs are held, but not in its own process."""
+        began = time.time()
+        process = act.start()
+        act.wait_until_planned(since=began)
+        act.hold.touch()
+        return process
+
+    def _sweep(
+        self, name: str, runs: int = _FEW, words: Sequence[str] = ("chunk=1",)
+    ) -> Sweep:
+        folder = self._stage.folder / f"joblib-{name}"
+        return Sweep(
+            folder=folder,
+            runs=runs,
+            kinds=["Slow"],
+            launcher=["launcher=joblib", "hydra.launcher.n_jobs=2", *words],
+            environment={**os.environ, HOLD: str(hold_of(folder))},
+        )
 
 
 class RayActs:

@@ -114,6 +114,22 @@ class Sweep:
             _PATIENCE,
         )
 
+    def workers(self) -> list[int]:
+        """Returns the processes of this machine that fly runs."""
+        return [
+            int(folder.last_worker.split()[1])
+            for folder in self.folders()
+            if folder.state is RunState.RUNNING
+        ]
+
+    def wait_until_alone(self) -> None:
+        """Waits until no process of the sweep is left."""
+        wait_for(
+            f"no process of {self.folder.name}",
+            lambda: not processes_with(f"{_MARK}={self.folder}"),
+            _END,
+        )
+
     def errors(self) -> list[dict[str, Any]]:
         """Returns why runs failed."""
         return [
@@ -150,11 +166,7 @@ class Sweep:
         for seed, numbers in self.numbers().items():
             if seed in reference:
                 assert numbers == reference[seed], f"seed {seed} has other numbers"
-        wait_for(
-            f"no process of {self.folder.name}",
-            lambda: not processes_with(f"{_MARK}={self.folder}"),
-            _END,
-        )
+        self.wait_until_alone()
 
 
 def end_of(process: subprocess.Popen) -> tuple[int, str]:

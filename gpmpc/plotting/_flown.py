@@ -1,6 +1,6 @@
 """Draws a closed loop as it comes back from ``closed_loop``: one panel a unit."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,8 +17,10 @@ from gpmpc.plotting._style import (
     name_of,
     styled,
 )
-from gpmpc.simulation import Rollout
-from gpmpc.systems import System
+
+if TYPE_CHECKING:
+    from gpmpc.simulation import Rollout
+    from gpmpc.systems import System
 
 
 class _Panel(NamedTuple):
@@ -29,7 +31,7 @@ class _Panel(NamedTuple):
 
 
 @styled
-def flight_figure(rollout: Rollout, system: System) -> Figure:
+def flight_figure(rollout: "Rollout", system: "System") -> Figure:
     """Draws states against their references, and below them inputs with their bounds.
 
     Signals of one unit share a panel; one whose unit is not known has its own.
@@ -54,6 +56,10 @@ def flight_figure(rollout: Rollout, system: System) -> Figure:
     See Also:
         ``tracking_figure`` and ``inputs_figure``, which draw a recording.
     """
+    # Here: with them everything else loads, which a report of a sweep does not need.
+    from gpmpc.simulation import Rollout
+    from gpmpc.systems import System
+
     check_kind("rollout", rollout, Rollout, "a Rollout of closed_loop")
     check_kind("system", system, System, "a System")
     n = len(system.state_names)
@@ -92,7 +98,7 @@ def flight_figure(rollout: Rollout, system: System) -> Figure:
     return figure
 
 
-def _panels(system: System, names: tuple[str, ...]) -> list[_Panel]:
+def _panels(system: "System", names: tuple[str, ...]) -> list[_Panel]:
     """Returns the signals by unit, in the order of their names."""
     panels: list[_Panel] = []
     for index, name in enumerate(names):
@@ -105,7 +111,9 @@ def _panels(system: System, names: tuple[str, ...]) -> list[_Panel]:
     return panels
 
 
-def _draw_states(axis: Axes, rollout: Rollout, system: System, panel: _Panel) -> None:
+def _draw_states(
+    axis: Axes, rollout: "Rollout", system: "System", panel: _Panel
+) -> None:
     """Draws states of one unit, each with its reference in its colour."""
     names = [system.state_names[index] for index in panel.indices]
     for colour, index in zip(COLOURS * len(names), panel.indices, strict=False):
@@ -121,7 +129,9 @@ def _draw_states(axis: Axes, rollout: Rollout, system: System, panel: _Panel) ->
     _name_lines(axis, names, panel, system.z_down)
 
 
-def _draw_inputs(axis: Axes, rollout: Rollout, system: System, panel: _Panel) -> None:
+def _draw_inputs(
+    axis: Axes, rollout: "Rollout", system: "System", panel: _Panel
+) -> None:
     """Draws inputs of one unit as steps, with their finite bounds."""
     names = [system.input_names[index] for index in panel.indices]
     for colour, index in zip(COLOURS * len(names), panel.indices, strict=False):
