@@ -9,7 +9,7 @@ or, where there is a nominal model f, x_i[k+1] - f_i = c h (x_j[k+1] - f_j). c i
 for a rate that moves evenly within the step h, 1 for a simulator that moves a position
 by the new rate (semi-implicit Euler); the data tell, by two-stage least squares, since
 noise of the rates would bias plain least squares. What is then left of a position is
-its noise, as a rule, and is not learned. Where it is mostly a function of state and
+its noise, as a rule, and is not learned. Where a part of it is a function of state and
 input (a rate of body axes, or a coarse time step), it is.
 """
 
@@ -24,9 +24,12 @@ from gpmpc.models._features import Features
 from gpmpc.models._nominal import Affine
 from gpmpc.models._residual_data import Nominal, nominal_next_state
 
-_LEARNABLE = 0.5  # of the variance of what is left: from this on it is learned
+# Of the variance of what is left: from this on it is learned. An error that depends on
+# the state adds up from step to step, noise only by its root: a tenth of the variance
+# of one step is half of that of ten.
+_LEARNABLE = 0.1
 _EVEN = 0.5  # c of a rate that moves evenly within a step
-_SIGNIFICANT = 3.0  # standard errors from which on c is another one
+_SIGNIFICANT = 3.0  # standard errors from which on c is another one, or a part is none
 _ROWS_PER_TERM = 3  # of the regressions
 
 
@@ -79,7 +82,7 @@ def kinematic_residual(
         A[position] += time_step * A[rate] * c
         A[position, rate] += time_step * (1 - c)
         effect_by_rate = c * time_step * effect[rate]
-        if _learnable_part(remainder, basis) > _LEARNABLE:
+        if _is_learnable(remainder, basis):
             effect[position] += effect_by_rate
             continue
         effect[position] = effect_by_rate
@@ -141,18 +144,21 @@ def _integration_coefficient(
     return min(max(c, 0.0), 1.0)
 
 
-def _learnable_part(remainder: Tensor, basis: Tensor) -> float:
-    """Returns which part of the mean square of a column (N,) the features explain.
+def _is_learnable(remainder: Tensor, basis: Tensor) -> bool:
+    """Whether the features explain enough of the mean square of a column (N,).
 
-    It is corrected for the number of terms, which explain some of any noise.
+    The part that they explain is corrected for the number of terms of the basis (N, t),
+    which explain some of any noise, and has to exceed what noise would show of it.
     """
     size, terms = basis.shape
     whole = float(remainder.square().sum())
     if terms >= size or whole == 0.0:
-        return 0.0
+        return False
     unexplained = remainder - basis @ (basis.mT @ remainder)
     unexplained_variance = float(unexplained.square().sum()) / (size - terms)
-    return 1.0 - unexplained_variance / (whole / size)
+    part = 1.0 - unexplained_variance / (whole / size)
+    standard_error = (2 * terms / (size * (size - terms))) ** 0.5
+    return part > max(_LEARNABLE, _SIGNIFICANT * standard_error)
 
 
 def positions_by_rate(

@@ -6,12 +6,20 @@ import numpy as np
 import pytest
 import torch
 
+from gpmpc.calibration import Recording, calibrate
 from gpmpc.datasets import RandomData
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gp import GPPosterior, SparseTrainer, Trainer, Transitions, standardize
 from gpmpc.models import ResidualModel, train
+from gpmpc.propagation import Linearization
 from gpmpc.signals import Signals
-from gpmpc.systems import System, cart_pole, double_integrator, pendulum, step_many
+from gpmpc.systems import (
+    System,
+    cart_pole,
+    double_integrator,
+    pendulum,
+    step_many,
+)
 
 QUICK = {"restarts": 0, "tolerance": 1e-4}
 
@@ -82,9 +90,12 @@ class Euler:
 class Drifting(Euler):
     """A position that a current moves as well: its rate is not all of it."""
 
+    def __init__(self, drift):
+        self.drift = drift
+
     def successor(self, x, u):
         velocity = x[1] + 0.1 * u[0]
-        return [x[0] + 0.1 * velocity + 0.2 * np.sin(x[0]), velocity]
+        return [x[0] + 0.1 * velocity + self.drift * np.sin(x[0]), velocity]
 
 
 def euler_system(dynamics):
@@ -104,11 +115,28 @@ def test_how_a_position_follows_is_seen_in_the_data():
     plant = euler_system(Euler())
     semi_implicit = train(rows(plant, noise=1e-4), system=plant, **QUICK).posterior
     assert semi_implicit.B.ravel().tolist() == pytest.approx([0.1, 1.0], rel=0.01)
-    plant = euler_system(Drifting())
+    plant = euler_system(Drifting(0.2))
     drifting = train(rows(plant), system=plant, **QUICK).posterior
     assert drifting.residual.output_dim == 2  # what the rate does not explain
     fresh = rows(plant, noise=0.0, seed=1)
     assert one_step_error(drifting, fresh) < 0.01
+
+
+def test_a_small_error_that_adds_up_is_learned():
+    # A third of the variance of a step, and most of that of ten.
+    plant = euler_system(Drifting(0.004))
+    model = train(rows(plant, size=300), system=plant, **QUICK).posterior
+    assert model.residual.output_dim == 2
+    fresh = Recording.chained(rows(plant, size=150, seed=1))
+    found = calibrate(model, fresh, Linearization(), 10, levels=[0.95])
+    assert float(found.coverage[[0, 9], 0].min()) > 0.9
+
+
+def test_noise_alone_is_not_learned():
+    plant = euler_system(Euler())
+    for seed in range(5):
+        data = rows(plant, size=60, seed=seed)
+        assert train(data, system=plant, **QUICK).posterior.residual.output_dim == 1
 
 
 def test_accelerations_move_velocities_and_these_positions():
