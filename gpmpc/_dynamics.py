@@ -109,6 +109,12 @@ class TensorModel:
         return self._part.device
 
 
+def linearization_of(model: DynamicsModel) -> Callable[..., Linearized]:
+    """Returns a model's own ``linearize``, or one by autograd where it has none."""
+    method = getattr(model, "linearize", None)
+    return partial(linearize_by_autograd, model) if method is None else method
+
+
 def linearize(
     model: DynamicsModel, states: Array, inputs: Array, covariance: bool = True
 ) -> Linearized:
@@ -120,10 +126,7 @@ def linearize(
         inputs: u (K, m).
         covariance: Whether the covariances at the points are computed.
     """
-    method = getattr(model, "linearize", None)
-    if method is None:
-        return linearize_by_autograd(model, states, inputs, covariance)
-    return method(states, inputs, covariance)
+    return linearization_of(model)(states, inputs, covariance)
 
 
 def linearize_by_autograd(

@@ -11,6 +11,9 @@ from enum import Enum
 class Status(Enum):
     """How a solve ended; the value is the advice to the user."""
 
+    #: whether the residuals of the solution meet the tolerance
+    solved: bool
+
     SOLVED = "solved to the requested tolerance"
     INFEASIBLE = (
         "no point satisfies the constraints: soften state constraints, "
@@ -43,10 +46,8 @@ class Status(Enum):
         "the plan is the best there was; loosen it"
     )
 
-    @property
-    def solved(self) -> bool:
-        """Whether the residuals of the solution meet the tolerance."""
-        return self in (Status.SOLVED, Status.SOFT_BOUND_MISSED)
+    def __init__(self, _: str) -> None:
+        self.solved = self.name in ("SOLVED", "SOFT_BOUND_MISSED")
 
     @property
     def advice(self) -> str:

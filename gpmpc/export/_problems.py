@@ -8,7 +8,6 @@ from gpmpc.export._filter import Estimator, filter_definitions
 from gpmpc.export._functions import FunctionWriter
 from gpmpc.export._text import Numbers, comment, integers
 from gpmpc.mpc import GPMPC
-from gpmpc.mpc._constraints import ConstraintRows, _FixedRows
 
 Array = np.ndarray
 
@@ -61,17 +60,12 @@ def tightens(controller: GPMPC) -> bool:
 
 def rolls_out(controller: GPMPC) -> bool:
     """Returns whether every plan is rolled out before it is judged."""
-    prediction = controller.prediction
-    return prediction.constraints.smooth or prediction.settings.rolled_out
+    return controller.prediction.rolls_out
 
 
 def _kappas(controller: GPMPC) -> Array:
     """Returns the deviations between means and sides (r,)."""
-    rows = controller.prediction.constraints._rows
-    margins = getattr(rows, "_margins", None)
-    if margins is None:
-        return np.zeros(controller.prediction.constraints.per_stage)
-    return margins[0]
+    return controller.prediction.constraints.margins[0]
 
 
 def definitions(
@@ -131,7 +125,7 @@ def _flags(controller: GPMPC, numbers: Numbers, on_failure: str) -> dict[str, bo
         "GPMPC_FEEDBACK": settings.feedback,
         "GPMPC_ROLLS_OUT": rolls_out(controller),
         "GPMPC_HELD": settings.is_held,
-        "GPMPC_INCREMENTAL": settings.is_incremental,
+        "GPMPC_INCREMENTAL": settings.is_held,
         "GPMPC_ESTIMATES": settings.disturbance_gain > 0,
         "GPMPC_HOLDS": on_failure == "hold",
     }
@@ -143,8 +137,7 @@ def tables(controller: GPMPC, numbers: Numbers) -> str:
     problem = controller.problem
     cost = prediction.costs.quadratic
     limits = prediction.limits
-    constraints = prediction.constraints
-    gradients, lower, upper = _linear_rows(constraints)
+    rows = prediction.constraints.linear
     table = numbers.table
     parts = [
         table("state_weights", cost.state[:, 0], "Q of s_1 .. (n, n)"),
@@ -155,23 +148,14 @@ def tables(controller: GPMPC, numbers: Numbers) -> str:
         table("input_upper", limits.upper),
         table("rate_lower", limits.rate_lower, "bounds of u_k - u_{k-1} (H, m)"),
         table("rate_upper", limits.rate_upper),
-        table("row_gradients", gradients, "of the states' rows by the state (r, n)"),
-        table("row_lower", lower, "bounds of the rows (H, r)"),
-        table("row_upper", upper),
+        table("row_gradients", rows.F, "of the states' rows by the state (r, n)"),
+        table("row_lower", rows.lower, "bounds of the rows (H, r)"),
+        table("row_upper", rows.upper),
         table("row_prices", _prices(controller, numbers), "of violations (r,)"),
         integers("cost_angles", problem.cost.angle_indices, "errors modulo 2 pi"),
         integers("state_angles", prediction.angles, "angles of the cost or the model"),
     ]
     return "\n".join([*parts, *_optional_tables(controller, numbers)])
-
-
-def _linear_rows(constraints: ConstraintRows) -> tuple[Array, Array, Array]:
-    """Returns gradients (r, n) of the rows, and their bounds (H, r), untightened."""
-    rows = constraints._rows
-    if isinstance(rows, _FixedRows):
-        return rows._rows.E[0], rows._rows.lower, rows._rows.upper
-    linear = rows._linear
-    return linear.F, linear.lower, linear.upper
 
 
 def _optional_tables(controller: GPMPC, numbers: Numbers) -> list[str]:
@@ -184,7 +168,7 @@ def _optional_tables(controller: GPMPC, numbers: Numbers) -> list[str]:
         parts.append(integers("row_is_elastic", elastic, "rows that give way"))
     if constraints.smooth:
         smooth = np.zeros(constraints.per_stage, dtype=int)
-        for part in getattr(constraints._rows, "_smooth", ()):
+        for part in constraints.smooth_rows:
             smooth[part.columns] = 1
         parts.append(integers("row_is_smooth", smooth.tolist(), "linearised rows"))
     if tightens(controller):

@@ -56,7 +56,11 @@ class ConstraintRows:
         signs: 1 where a row has upper bounds, -1 where it has lower ones (r,).
         applies: Whether a row has a bound at a stage (H, r).
         smooth: Whether there is any ``Inequality``.
+        smooth_rows: These, and the columns of their rows.
         per_stage: r.
+        linear: The rows as they are declared, untightened.
+        margins: Deviations that bounds move inwards by (H, r): kappa in the mode
+            ``zero_order``, else zero.
     """
 
     def __init__(self, problem: Problem, horizon: int, covariance: Covariance):
@@ -65,7 +69,8 @@ class ConstraintRows:
             for constraint in problem.constraints
         ]
         rows = _stack(parts, problem.state_dim, horizon)
-        smooth = _find_smooth(problem.constraints, parts)
+        self.linear = rows
+        self.smooth_rows = _find_smooth(problem.constraints, parts)
         self.prices = rows.prices
         self.elastic = rows.elastic
         self.gives_way = bool(rows.elastic.any())
@@ -73,16 +78,25 @@ class ConstraintRows:
         self.applies = np.isfinite(rows.lower) | np.isfinite(rows.upper)
         self.per_stage = len(rows.kappa)
         self.soft = bool(np.isfinite(rows.prices).any())
-        self.smooth = bool(smooth)
-        holds_covariance = covariance in ("full", "diagonal")
-        tightens = covariance == "zero_order" and bool(rows.kappa.any())
-        self._rows: _FixedRows | _PlanRows
-        if smooth or tightens or (self.per_stage and holds_covariance):
-            self._rows = _PlanRows(
-                rows, smooth, self.signs, problem.input_dim, covariance
-            )
-        else:
-            self._rows = _FixedRows(rows, problem.input_dim, covariance)
+        self.smooth = bool(self.smooth_rows)
+        margins = rows.kappa if covariance == "zero_order" else np.zeros(self.per_stage)
+        self.margins = np.tile(margins, (horizon, 1))
+        self._covariance: Covariance = covariance
+        self._signed_kappa = self.signs * rows.kappa
+        self._no_inputs = np.zeros((0, 0, problem.input_dim))
+        holds_covariance = self.per_stage > 0 and covariance in ("full", "diagonal")
+        self._fixed: StageRows | None = None
+        if not (self.smooth or margins.any() or holds_covariance):
+            self._fixed = self._rows_that_stay()
+
+    def _rows_that_stay(self) -> StageRows:
+        """Returns the rows where no plan and no covariance moves them."""
+        linear = self.linear
+        n = linear.F.shape[1]
+        E = _by_belief(
+            linear.F[None], np.zeros((1, n, n)), self._covariance, self._signed_kappa
+        )
+        return StageRows(E, self._no_inputs, linear.lower, linear.upper)
 
     def at(
         self,
@@ -101,72 +115,17 @@ class ConstraintRows:
             parameters: Of smooth constraints by stage (H, q).
             kappas: By stage (H,), in the place of those of the constraints.
         """
-        return self._rows.at(plan, covariances, stages, parameters, kappas)
-
-
-class _FixedRows:
-    """Rows that no plan and no covariance moves."""
-
-    def __init__(self, rows: _Rows, input_dim: int, covariance: Covariance):
-        n = rows.F.shape[1]
-        kappa = np.zeros(len(rows.F))
-        self._rows = StageRows(
-            E=_by_belief(rows.F[None], np.zeros((1, n, n)), covariance, kappa),
-            D=np.zeros((0, 0, input_dim)),  # no row holds inputs
-            lower=rows.lower,
-            upper=rows.upper,
-        )
-
-    def at(
-        self,
-        plan: Plan,
-        covariances: Array,
-        stages: int,
-        parameters: Array | None,
-        kappas: Array | None,
-    ) -> StageRows:
-        """Returns the rows; see ``ConstraintRows.at``."""
-        return self._rows
-
-
-class _PlanRows:
-    """Rows that depend on a plan: tightened by its covariances, or linearised at it."""
-
-    def __init__(
-        self,
-        rows: _Rows,
-        smooth: Sequence[_SmoothRows],
-        signs: Array,
-        input_dim: int,
-        covariance: Covariance,
-    ):
-        horizon = len(rows.lower)
-        self._linear = rows
-        self._smooth = smooth
-        self._no_inputs = np.zeros((0, 0, input_dim))
-        self._covariance: Covariance = covariance
-        self._signed_kappa = signs * rows.kappa
-        margins = rows.kappa if covariance == "zero_order" else np.zeros(len(signs))
-        self._margins = np.tile(margins, (horizon, 1))
-
-    def at(
-        self,
-        plan: Plan,
-        covariances: Array,
-        stages: int,
-        parameters: Array | None,
-        kappas: Array | None,
-    ) -> StageRows:
-        """Returns the rows; see ``ConstraintRows.at``."""
-        lower = self._linear.lower.copy()
-        upper = self._linear.upper.copy()
-        F = self._linear.F[None]
+        if self._fixed is not None:
+            return self._fixed
+        lower = self.linear.lower.copy()
+        upper = self.linear.upper.copy()
+        F = self.linear.F[None]
         D = self._no_inputs
-        if self._smooth:
+        if self.smooth:
             F, D = self._linearize_smooth(plan, parameters, upper)
-        margins = self._margins
+        margins = self.margins
         if kappas is not None:
-            margins = np.where(self._margins > 0, kappas[:, None], 0.0)
+            margins = np.where(self.margins > 0, kappas[:, None], 0.0)
         _tighten.unchecked(F, margins, covariances, lower, upper)
         E = _by_belief(
             F, covariances[1 : stages + 1], self._covariance, self._signed_kappa
@@ -177,12 +136,12 @@ class _PlanRows:
         self, plan: Plan, parameters: Array | None, upper: Array
     ) -> tuple[Array, Array]:
         """Returns gradients of all rows by state and input; moves the smooth bounds."""
-        linear = self._linear.F
+        linear = self.linear.F
         H, r = upper.shape
         means = np.ascontiguousarray(plan.states[1:, : linear.shape[1]])
         F = np.repeat(linear[None], H, axis=0)
         D = np.zeros((H, r, plan.inputs.shape[1]))
-        for constraint, columns in self._smooth:
+        for constraint, columns in self.smooth_rows:
             values, by_state, by_input = constraint.expand(
                 means, plan.inputs, parameters
             )

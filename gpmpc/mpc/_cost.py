@@ -8,7 +8,7 @@ Z = [J, e]' W [J, e] and e = y(z') - J z' - c.
 import inspect
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -88,7 +88,7 @@ class Tracking:
         object.__setattr__(self, "R", R)
         object.__setattr__(self, "terminal", terminal)
 
-    @property
+    @cached_property
     def angle_indices(self) -> tuple[int, ...]:
         """The ``angles``; none where they are left to a controller's model."""
         return tuple(self.angles or ())

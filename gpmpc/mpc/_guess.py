@@ -114,7 +114,7 @@ def initial_guess(prediction: PredictionModel, request: Request) -> Plan:
     Inputs handed over alone lead to the model's states; where these are not finite, the
     plan's are x_0. The form ``velocity`` holds the belief and the previous input.
     """
-    if prediction.settings.is_held:
+    if prediction.is_held:
         return _hold_belief(prediction, request)
     means = _guess_means(prediction, request)
     inputs = _guess_inputs(prediction, request)
@@ -125,11 +125,15 @@ def initial_guess(prediction: PredictionModel, request: Request) -> Plan:
 def _hold_belief(prediction: PredictionModel, request: Request) -> Plan:
     """Returns the belief and the previous input over the whole horizon."""
     count = prediction.horizon + 1
-    means = np.tile(request.state, (count, 1))
-    covariances = np.zeros((count, prediction.state_dim, prediction.state_dim))
+    covariance = np.zeros((1, *request.covariance.shape))
     if prediction.settings.covariance != "none":
-        covariances[:] = request.covariance
-    return prediction.plan_of(means, request.constant_guess, covariances)
+        covariance[0] = request.covariance
+    state = prediction.linearizer.state(request.state[None], covariance)
+    return Plan(
+        states=np.tile(state, (count, 1)),
+        inputs=request.constant_guess,
+        covariances=np.repeat(covariance, count, axis=0),
+    )
 
 
 def _guess_means(prediction: PredictionModel, request: Request) -> Array:

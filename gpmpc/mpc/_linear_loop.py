@@ -57,7 +57,7 @@ class LinearLoop:
         self.horizon = prediction.horizon
         settings = prediction.settings
         self._disturbance_gain = settings.disturbance_gain
-        if settings.is_incremental:  # an increment holds all of the last error
+        if settings.is_held:  # an increment holds all of the last error
             self._disturbance_gain = 1.0
         self._model: Any = plant or ahead or prediction.model
         learned = bool(to_array(self._model.noise_covariance).any())

@@ -38,7 +38,7 @@ from gpmpc._compiled import compiled
 from gpmpc._dynamics import (
     DynamicsModel,
     check_next_states,
-    linearize,
+    linearization_of,
     tensors_for,
     to_array,
 )
@@ -63,8 +63,7 @@ from gpmpc.mpc._linear_quadratic import (
 from gpmpc.mpc._riccati import finite_horizon_lqr
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization, Propagator, differentiate
-from gpmpc.propagation import linearize as linearize_belief
-from gpmpc.propagation._local_model import square_roots
+from gpmpc.propagation._local_model import expand_belief, square_roots
 from gpmpc.signals import signals_of
 
 Array = np.ndarray
@@ -121,7 +120,7 @@ class PredictionSettings:
             raise SettingError("rolled_out", f"{rule}; got form 'velocity'")
         gain = self.disturbance_gain
         check_number("disturbance_gain", gain, least=0)
-        if self.is_incremental and gain > 0:
+        if self.is_held and gain > 0:
             rule = "must be 0 for form 'velocity', which needs none"
             raise SettingError("disturbance_gain", f"{rule}; got {gain}")
         if gain > 1:
@@ -130,12 +129,10 @@ class PredictionSettings:
 
     @property
     def is_held(self) -> bool:
-        """Whether one linearisation, at the belief, is held over the horizon."""
-        return self.form == "velocity"
+        """Whether one linearisation, at the belief, is held over the horizon.
 
-    @property
-    def is_incremental(self) -> bool:
-        """Whether stages hold for increments, in which a constant error cancels."""
+        Its stages hold for increments, in which a constant error cancels.
+        """
         return self.form == "velocity"
 
     @property
@@ -199,8 +196,9 @@ class PredictionModel:
         self.input_dim = problem.input_dim
         self.horizon = horizon
         self.settings = settings
+        self.is_held = settings.is_held
         #: K, the number of stage models: H, or the one that is held
-        self.stage_count = 1 if settings.is_held else horizon
+        self.stage_count = 1 if self.is_held else horizon
         self._set_model(model)
         lower, upper = problem.inputs.by_stage(horizon)
         rate_lower, rate_upper = problem.input_rates.by_stage(horizon)
@@ -211,6 +209,9 @@ class PredictionModel:
         count = horizon if problem.input_rates.finite else 0
         self.bounds = InputBounds(lower, upper, rate_lower[:count], rate_upper[:count])
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
+        #: whether every last plan of a decision is rolled out: curved constraints are
+        #: judged where it leads
+        self.rolls_out = settings.rolled_out or self.constraints.smooth
         self.costs = StageCosts(problem, horizon, self.linearizer)
 
     def with_model(self, model: DynamicsModel) -> "PredictionModel":
@@ -280,9 +281,8 @@ class PredictionModel:
         """Returns the problem at a plan from its stages: covariances, rows, cost."""
         cost = self.costs.at(plan, request.parameters)
         covariances = self._covariances_of(plan, stages, cost, request)
-        previous = request.previous
-        if self.settings.is_incremental and previous is not None:
-            stages = self._in_increments(plan, stages, request, previous)
+        if self.is_held and request.previous is not None:
+            stages = self._in_increments(plan, stages, request, request.previous)
         rows = self.constraints.at(
             plan, covariances, self.stage_count, request.parameters, request.kappas
         )
@@ -295,7 +295,7 @@ class PredictionModel:
         mode = self.linearizer.covariance
         if mode == "zero_order":
             return self.predict_covariances(stages, cost, request.covariance)
-        if self.settings.is_held and mode != "none":
+        if self.is_held and mode != "none":
             _, after = self.linearizer.moments(stages.next, plan.covariances)
             covariances = np.repeat(after, self.horizon + 1, axis=0)
             covariances[0] = request.covariance
@@ -382,6 +382,7 @@ class StageLinearizer:
         self.propagator = propagator
         self.covariance = covariance
         self._n = model.state_dim
+        self._linearize_model = linearization_of(model)
         first_order = getattr(propagator, "first_order", False)
         zero_order = covariance == "zero_order"
         at_means = zero_order and first_order
@@ -460,9 +461,8 @@ class StageLinearizer:
         self, states: Array, inputs: Array, _: Array
     ) -> tuple[Array, Array, Array, Array]:
         """Returns next means, A, B and V of the model at certain states."""
-        local = linearize(
-            self.model, states, inputs, covariance=self.covariance == "zero_order"
-        )
+        has_covariance = self.covariance == "zero_order"
+        local = self._linearize_model(states, inputs, covariance=has_covariance)
         V = local.covariance
         if V is None:
             V = np.zeros((len(states), self._n, self._n))
@@ -496,9 +496,8 @@ class StageLinearizer:
         """Returns next [mu; vec S], its A and B, and no V."""
         means = states[:, : self._n]
         belief, input = self._tensors(means, covariances, inputs)
-        local = linearize_belief(self.propagator, self.model, belief, input)
-        after = to_array(local.next_state)
-        return after, to_array(local.A), to_array(local.B), np.zeros_like(covariances)
+        local = expand_belief(self.propagator, self.model, belief, input)
+        return local.next_state, local.A, local.B, np.zeros_like(covariances)
 
     def _linearize_deviations(
         self, states: Array, inputs: Array, covariances: Array

@@ -93,25 +93,13 @@ class StepForecast(NamedTuple):
     defect_prices: Array  # above the multipliers of the dynamics (p,)
 
 
-class StepMeasures(NamedTuple):
-    """The cost of a plan, and the length of a program's step away from it."""
-
-    cost: float  # of the plan, with the price of its violated rows
-    squared_length: float  # of the step in the metric of the cost
-
-
-class Continuity(NamedTuple):
-    """Whether a program's step is one more along the last plan."""
-
-    continues: bool
-    squared_length: float  # of the step in the metric of the cost
-
-
 class Iterate(NamedTuple):
     """The problem at the next plan of an iteration, and how the iteration ends."""
 
     local: LocalProblem
-    status: Status | None  # None where it goes on
+    status: Status | None  # None where one more program is due
+    # whether the plan, if it is the last one, is to be rolled out before it is used
+    leaves_defects: bool = False
 
 
 class _Trial(NamedTuple):
@@ -167,31 +155,33 @@ def measure_continuity(
     local: LocalProblem,
     proposed: Plan,
     row_prices: Array,
-) -> Continuity:
-    """Tells whether a step is one more along the last plan, and how long it is.
+) -> tuple[bool, float]:
+    """Tells whether a step is one more along the last plan.
+
+    Also returns its length, squared in the metric of the cost.
 
     Then one program is enough, as in the real-time iteration. A step that leads much
     further than the last one, and is not slight beside the cost, answers a jump of the
     reference or of the state. On plants that bend much, the plans of one program a step
     are not consistent; iterating each of them is slower and, on swing-ups, no better.
     """
-    terms = PriceTerms(request.references, row_prices, 0.0)
-    measures = _measure_step.unchecked(local, terms, proposed)
-    squared_length = measures.squared_length
+    cost, squared_length = _measure_step.unchecked(
+        local, request.references, row_prices, proposed
+    )
     last_lengths = () if request.previous is None else request.previous.steps
     if len(last_lengths) == 0:
-        return Continuity(continues=True, squared_length=squared_length)
-    slight = _SLIGHT * (measures.cost + smallest_cost(prediction, request))
-    continues = squared_length <= max(slight, _FURTHER * last_lengths[0])
-    return Continuity(continues=continues, squared_length=squared_length)
+        return True, squared_length
+    slight = _SLIGHT * (cost + smallest_cost(prediction, request))
+    return squared_length <= max(slight, _FURTHER * last_lengths[0]), squared_length
 
 
 def smallest_cost(prediction: PredictionModel, request: Request) -> float:
     """Returns the cost of an input that is small beside the last one, the cheapest."""
-    lower, upper = prediction.problem.inputs.first
-    R = prediction.costs.quadratic.input[0]
     return _cost_of_small_input.unchecked(
-        R, lower, upper, request.references.previous_input
+        R=prediction.costs.quadratic.input[0],
+        lower=prediction.limits.lower[0],
+        upper=prediction.limits.upper[0],
+        previous_input=request.references.previous_input,
     )
 
 
@@ -266,7 +256,7 @@ class Globalization:
             return Iterate(local._replace(plan=proposed), Status.SOLVED)
         trial = self._search_line(local, program, proposed, forecast)
         if trial is not None:
-            return Iterate(trial, None)
+            return Iterate(trial, status=None)
         return self._end_without_step(local, proposed)
 
     def _raise_hard_price(self, multipliers: Array) -> None:
@@ -354,9 +344,9 @@ class Globalization:
             return Iterate(local._replace(plan=proposed), Status.SOLVED)
         if size**2 <= _SLIGHT and size <= _NEARLY * self._tolerance:
             return Iterate(local, Status.SOLVED)
-        if self._curvature.forget():  # the updates may be what misleads
-            return Iterate(local, None)
-        return Iterate(local, Status.STALLED)
+        goes_on = self._curvature.forget()  # the updates may be what misleads
+        status = None if goes_on else Status.STALLED
+        return Iterate(local, status)
 
 
 class LagrangianGradient(NamedTuple):
@@ -488,11 +478,12 @@ def _priced_cost(cost, terms, rows, plan):
 
 
 @compiled
-def _measure_step(local, terms, proposed):
-    """Returns the ``StepMeasures`` of a program's step."""
+def _measure_step(local, references, prices, proposed):
+    """Returns the cost of a plan, violations included, and a step's squared length."""
+    terms = PriceTerms(references, prices, 0.0)
     cost = _priced_cost(local.cost, terms, local.rows, local.plan)
-    squared_length = _cost_of_step(local.cost, terms.references, local.plan, proposed)
-    return StepMeasures(cost, squared_length)
+    squared_length = _cost_of_step(local.cost, references, local.plan, proposed)
+    return cost, squared_length
 
 
 @compiled

@@ -30,7 +30,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -279,7 +279,7 @@ class GPMPC:
         most_programs: int,
     ) -> Decision:
         """Returns the decision that up to so many programs lead to."""
-        return _Attempt(self, request, stopwatch, most_programs).run(local)
+        return _ControlStep(self, request, stopwatch, most_programs).run(local)
 
     def _decide_first(
         self, local: LocalProblem, request: Request, stopwatch: Stopwatch
@@ -432,15 +432,7 @@ class NonlinearGPMPC(GPMPC):
         )
 
 
-class _Step(NamedTuple):
-    """The problem at the plan that a program's step leads to."""
-
-    local: LocalProblem
-    status: Status | None  # None where the iteration goes on
-    leaves_defects: bool  # whether the plan is to be rolled out before it is used
-
-
-class _Attempt:
+class _ControlStep:
     """One decision's programs, from a first guess to a plan that is good enough."""
 
     def __init__(
@@ -476,40 +468,23 @@ class _Attempt:
                 if local.plan is not guess:
                     local = self._close_defects(local, local, program)
                 return self._conclude(local, guess, solution, solution.status)
-            step = self._step(local, program, solution)
-            if step.status is None and self._may_go_on:
-                local = step.local
+            iterate = self._take_step(local, program, solution)
+            if iterate.status is None and self._may_go_on:
+                local = iterate.local
                 continue
-            ending = self._end(step, local, program, solution)
-            if ending.status is not None:
-                return self._conclude(ending.local, guess, solution, ending.status)
-            # A curved bound lies elsewhere than the program saw it.
-            local = self._prediction.linearize(ending.local.plan, self._request)
-
-    def _end(
-        self,
-        step: _Step,
-        local: LocalProblem,
-        program: CondensedProgram,
-        solution: QPSolution,
-    ) -> Iterate:
-        """Returns the plan to end with, rolled out where that is due, and its status.
-
-        The iteration goes on where the plan misses a smooth constraint by more than its
-        program promised, and one more program may be solved.
-        """
-        ending = step.local
-        if step.leaves_defects or self._rolls_out:
-            ending = self._close_defects(ending, local, program)
-        if step.status is None:
-            return Iterate(ending, self._limit)
-        if not step.status.solved or self._keeps_promise(ending, solution):
-            return Iterate(ending, step.status)
-        if self._may_go_on:
-            return Iterate(ending, None)
-        # A single program was never to keep more than it promised.
-        status = step.status if self._most_programs == 1 else self._limit
-        return Iterate(ending, status)
+            ending = iterate.local
+            if iterate.leaves_defects or self._prediction.rolls_out:
+                ending = self._close_defects(ending, local, program)
+            breaks_promise = self._breaks_promise(iterate.status, ending, solution)
+            if breaks_promise and self._may_go_on:
+                # A curved bound lies elsewhere than the program saw it.
+                local = self._prediction.linearize(ending.plan, self._request)
+                continue
+            status = iterate.status
+            # A single program was never to keep more than it promised.
+            if status is None or (breaks_promise and self._most_programs > 1):
+                status = self._limit
+            return self._conclude(ending, guess, solution, status)
 
     @property
     def _may_go_on(self) -> bool:
@@ -523,12 +498,6 @@ class _Attempt:
         if self._programs < self._most_programs:
             return Status.TIME_LIMIT
         return Status.ITERATION_LIMIT
-
-    @property
-    def _rolls_out(self) -> bool:
-        """Whether every last plan is rolled out."""
-        prediction = self._prediction
-        return prediction.constraints.smooth or prediction.settings.rolled_out
 
     def _condense(self, local: LocalProblem) -> CondensedProgram:
         """Returns the quadratic program in the inputs."""
@@ -576,7 +545,10 @@ class _Attempt:
                 prices = np.full(len(program.G), np.inf)
                 soft = np.tile(row_prices, self._prediction.horizon)
                 prices[len(prices) - len(soft) :] = soft
-            return solver.solve(_quadratic_program(program), warm_start, prices)
+            problem = QuadraticProgram.unchecked(
+                program.P, program.q, program.G, program.lower, program.upper
+            )
+            return solver.solve(problem, warm_start, prices)
         if warm_start is not None and warm_start.arrays[2].shape != program.G.shape:
             warm_start = None
         problem = QuadraticProgram.from_stacked(
@@ -607,13 +579,13 @@ class _Attempt:
         )
         return prices
 
-    def _step(
+    def _take_step(
         self, local: LocalProblem, program: CondensedProgram, solution: QPSolution
-    ) -> _Step:
+    ) -> Iterate:
         """Takes a program's step: whole where that is enough, else globalised."""
         planned = self._planned(program, solution, local)
         if self._whole_step_is_enough(local, planned.plan):
-            return _Step(planned, solution.status, leaves_defects=False)
+            return Iterate(planned, solution.status)
         if self._globalization is None:
             self._globalization = Globalization(
                 self._prediction,
@@ -627,7 +599,7 @@ class _Attempt:
         tightly_solved = iterate.status is Status.SOLVED
         if self._controller.iterations is None:  # its tolerance is a loose one
             tightly_solved = False
-        return _Step(iterate.local, iterate.status, leaves_defects=not tightly_solved)
+        return iterate._replace(leaves_defects=not tightly_solved)
 
     def _whole_step_is_enough(self, local: LocalProblem, proposed: Plan) -> bool:
         """Returns whether to take a step whole, as in the real-time iteration.
@@ -643,11 +615,11 @@ class _Attempt:
         may_stop_after_one = self._controller.iterations is None and follows
         if not may_stop_after_one or self._programs > 1:
             return False
-        continuity = measure_continuity(
+        continues, squared_length = measure_continuity(
             self._prediction, request, local, proposed, self._row_prices
         )
-        self._squared_lengths = [continuity.squared_length]
-        return continuity.continues
+        self._squared_lengths = [squared_length]
+        return continues
 
     def _planned(
         self, program: CondensedProgram, solution: QPSolution, local: LocalProblem
@@ -679,12 +651,19 @@ class _Attempt:
         except FAILURES:
             return ending
 
-    def _keeps_promise(self, ending: LocalProblem, solution: QPSolution) -> bool:
-        """Returns whether a plan keeps smooth constraints as well as its program."""
+    def _breaks_promise(
+        self, status: Status | None, ending: LocalProblem, solution: QPSolution
+    ) -> bool:
+        """Returns whether a solved plan misses curved bounds by more than its program.
+
+        A program sees them as they are at the plan before.
+        """
         if not self._prediction.constraints.smooth:
-            return True
+            return False
+        if status is None or not status.solved:
+            return False
         promised = float(solution.violation().max(initial=0.0))
-        return self._violation(ending) <= _SLIGHTLY_MORE * promised + KEPT
+        return self._violation(ending) > _SLIGHTLY_MORE * promised + KEPT
 
     def _violation(self, local: LocalProblem) -> float:
         """Returns by how much a plan misses a bound, at most."""
@@ -703,21 +682,19 @@ class _Attempt:
         A guess that was rolled out obeys the dynamics and counts as a plan.
         """
         self._stopwatch.lap("model")
-        request = self._request
         plan = local.plan
-        timing = self._stopwatch.timing
-        problem = QuadraticProgram._make(solution.arrays)
-        solved = status.solved
-        suboptimal = not solved and plan is not guess and self._keeps_hard_rows(local)
-        if not (solved or suboptimal):
-            failed = request.failed_decision(status, self._programs, timing)
-            return replace(failed, problem=problem, solution=solution)
+        suboptimal = False
+        if not status.solved:
+            suboptimal = plan is not guess and self._keeps_hard_rows(local)
+            if not suboptimal:
+                return self._failed_decision(solution, status)
         violation = self._violation(local)
         if status is Status.SOLVED and violation > KEPT:
             status = Status.SOFT_BOUND_MISSED
         means, covariances = self._prediction.linearizer.moments(
             plan.states, local.covariances
         )
+        stage_costs = local.stage_costs(self._request.references)
         inputs = plan.inputs.copy()
         return Decision(
             input=inputs[0],
@@ -726,16 +703,24 @@ class _Attempt:
             covariances=covariances,
             status=status,
             iterations=self._programs,
-            timing=timing,
-            problem=problem,
+            timing=self._stopwatch.timing,
+            problem=QuadraticProgram._make(solution.arrays),
             solution=solution,
-            disturbance=request.disturbance,
+            disturbance=self._request.disturbance,
             suboptimal=suboptimal,
             plan_novelty=self._novelty(local, means, inputs, covariances),
-            stage_costs=local.stage_costs(request.references),
+            stage_costs=stage_costs,
             violation=violation,
             steps=tuple(self._squared_lengths),
         )
+
+    def _failed_decision(self, solution: QPSolution, status: Status) -> Decision:
+        """Returns the decision of a step that found no plan to apply."""
+        failed = self._request.failed_decision(
+            status, self._programs, self._stopwatch.timing
+        )
+        problem = QuadraticProgram._make(solution.arrays)
+        return replace(failed, problem=problem, solution=solution)
 
     def _keeps_hard_rows(self, local: LocalProblem) -> bool:
         """Returns whether a plan keeps hard rows of the states, nearly."""
@@ -768,13 +753,6 @@ def _check_iterations(iterations: int | None, prediction: PredictionSettings) ->
     if iterations > 1 and not prediction.may_iterate:
         rule = f"form {prediction.form!r} is one quadratic program, so 1"
         raise SettingError("iterations", f"{rule}; got {iterations}")
-
-
-def _quadratic_program(program: CondensedProgram) -> QuadraticProgram:
-    """Returns the program as the solver takes it."""
-    return QuadraticProgram.unchecked(
-        program.P, program.q, program.G, program.lower, program.upper
-    )
 
 
 def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> bool:

@@ -70,23 +70,59 @@ def linearize(
             f"a local model needs an output a state; got {belief.dim} states, "
             f"{model.output_dim} outputs"
         )
+    expansion = expand_belief(propagator, model, belief, input)
+    A = expansion.A
+    B = expansion.B
+    s = _extended_state(belief.mean, expansion.root)
+    u = to_array(input.expand(*belief.mean.shape[:-1], -1))
+    c = expansion.next_state - (A @ s[..., None] + B @ u[..., None])[..., 0]
+    tensors = tensors_for(model, A, B, c, expansion.next_state)
+    return LocalModel(
+        A=tensors[0],
+        B=tensors[1],
+        c=tensors[2],
+        next=expansion.next,
+        next_state=tensors[3],
+    )
+
+
+class BeliefExpansion(NamedTuple):
+    """The next extended state at a belief and an input, with its derivatives."""
+
+    next: Gaussian
+    next_state: Array  # F(s, u) (*batch, p)
+    A: Array  # dF/ds (*batch, p, p)
+    B: Array  # dF/du (*batch, p, m)
+    root: Array  # of the belief's covariance (*batch, n, n)
+
+
+def expand_belief(
+    propagator: Propagator, model: Any, belief: Gaussian, input: Tensor
+) -> BeliefExpansion:
+    """Returns the next belief as an extended state, with its derivatives.
+
+    Arguments are those of ``differentiate``, constants of torch.
+    """
     propagation, sensitivity = differentiate(propagator, model, belief, input)
     after = propagation.belief
-    batch = belief.mean.shape[:-1]
     covariances = np.stack([to_array(belief.covariance), to_array(after.covariance)])
     roots = square_roots(covariances)  # of the belief and of the next one
-    means = np.stack([to_array(belief.mean), to_array(after.mean)])
-    vectors = roots.root.reshape(*means.shape[:-1], -1)
-    s, s_next = np.concatenate([means, vectors], axis=-1)
     A, B = _extended_derivatives(
         sensitivity, root=roots.root[0], next_r=roots.r[1], next_U=roots.U[1]
     )
-    u = to_array(input.expand(*batch, -1))
-    c = s_next - (A @ s[..., None] + B @ u[..., None])[..., 0]
-    tensors = tensors_for(model, A, B, c, s_next)
-    return LocalModel(
-        A=tensors[0], B=tensors[1], c=tensors[2], next=after, next_state=tensors[3]
+    return BeliefExpansion(
+        next=after,
+        next_state=_extended_state(after.mean, roots.root[1]),
+        A=A,
+        B=B,
+        root=roots.root[0],
     )
+
+
+def _extended_state(mean: Tensor, root: Array) -> Array:
+    """Returns s = [mu; vec(S)] (*batch, p)."""
+    vectors = root.reshape(*mean.shape[:-1], -1)
+    return np.concatenate([to_array(mean), vectors], axis=-1)
 
 
 def _extended_derivatives(
