@@ -7,7 +7,7 @@ import numpy as np
 from gpmpc._dynamics import Array
 from gpmpc.logs._fitting import PAST, fit_least_squares
 from gpmpc.logs._log import Log
-from gpmpc.models._correction import PENALTY, Correction
+from gpmpc.models._correction import PENALTY, Correction, Prior
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._windows import Windows
 
@@ -58,12 +58,12 @@ def _ridge_errors(
     """Computes the errors (W, steps, e) of a ridge regression with history."""
     ahead = max(steps)
     training_windows = train.windows(ahead, PAST, most=_RIDGE_WINDOWS)
-    ridge = Correction.fit(
+    (ridge,) = Correction.fit_each(
         kinematics=kinematics,
         windows=training_windows,
         predicted=_still(training_windows, ahead),
         steps=steps,
-        penalties=np.full((len(steps), windows.space.error_dim), PENALTY),
+        priors=[Prior(PENALTY)],
     )
     return windows.errors(ridge(windows, _still(windows, ahead)), steps)
 

@@ -1,7 +1,10 @@
 """Corrections by the past of the rollouts that held-out runs have.
 
-Their penalties are chosen on whole runs: each run, or block of one, is corrected by
-what the others say.
+Several are fitted, between the rollout as it is and a ridge regression that knows no
+model, and averaged. Which of them are is chosen on whole runs, for each group of states
+and step: each run, or block of one, is corrected by what the others say. The best one
+comes first, then, one by one, that with which the mean is best (Caruana et al., 2004,
+Ensemble selection from libraries of models).
 """
 
 from collections.abc import Sequence
@@ -11,13 +14,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpmpc._dynamics import Array
-from gpmpc.models._correction import Correction
+from gpmpc.models._correction import Correction, Prior
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._windows import Windows
 
 _PARTS = 6  # of the held-out runs, each corrected by what the others say
 _KNOTS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # steps of a correction
-_PENALTIES = (0.001, 0.01, 0.1, 1.0, 10.0, np.inf)  # tried of a correction
+_PRIORS = tuple(
+    Prior(penalty, movement)
+    for penalty in (np.inf, 10.0, 1.0, 0.1, 0.01, 0.001)
+    for movement in (1.0, 0.5, 0.0)
+)
+_NOTHING = 1e-300  # an error that is added, so that ratios of exact rollouts are one
+_MEMBERS = 8  # of an average, at most; one may be in it several times
 
 
 @dataclass(frozen=True)
@@ -60,17 +69,17 @@ class Rollouts:
         return cls(joined, np.concatenate([part.predicted for part in parts]))
 
 
-class ChosenPenalties(NamedTuple):
-    """Penalties of a correction, and what it gains with them on other runs."""
+class Averages(NamedTuple):
+    """Shares of corrections in their averages, and what is gained on other runs."""
 
-    penalties: Array  # the best ones (judged steps, groups)
-    ratios: Array  # of mean errors with and without the correction, likewise
+    shares: Array  # of each prior (priors, judged steps, groups)
+    ratios: Array  # of mean errors with and without (judged steps, groups)
 
 
-def choose_penalties(
+def choose_averages(
     kinematics: Kinematics, rollouts: Rollouts, judged_steps: Sequence[int]
-) -> ChosenPenalties:
-    """Chooses the penalties of a correction, for each judged step and group.
+) -> Averages:
+    """Chooses which corrections are averaged, for each judged step and group.
 
     Windows of the same run are no test of a correction, which follows what is common to
     them.
@@ -80,81 +89,97 @@ def choose_penalties(
         rollouts: Of all that was held out.
         judged_steps: Whose errors decide.
     """
-    without = rollouts.distances(judged_steps)
-    alternatives = [np.full(without.shape[1:], one) for one in _PENALTIES]
-    distances = np.empty((len(_PENALTIES), *without.shape))
-    for is_own in _parts_of_whole_runs(rollouts.windows):
-        corrections = _fit_corrections(
-            kinematics=kinematics,
-            rollouts=rollouts[~is_own],
-            knots=judged_steps,
-            judged_steps=judged_steps,
-            alternatives=alternatives,
-        )
+    errors = _errors_on_other_runs(kinematics, rollouts, judged_steps)
+    groups = rollouts.windows.space.groups
+    shares = np.empty((len(_PRIORS), len(judged_steps), len(groups)))
+    ratios = np.empty(shares.shape[1:])
+    for k in range(len(judged_steps)):
+        first = 0
+        for g, group in enumerate(groups):
+            entries = slice(first, first + group.error_dim)
+            own = errors[:, :, k, entries]
+            shares[:, k, g] = _choose_shares(own)
+            averaged = np.tensordot(shares[:, k, g], own, axes=1)
+            # The first prior leaves the rollouts as they are.
+            with_and_without = _mean_length(np.stack([averaged, own[0]])) + _NOTHING
+            ratios[k, g] = with_and_without[0] / with_and_without[1]
+            first += group.error_dim
+    return Averages(shares, ratios)
+
+
+def _errors_on_other_runs(
+    kinematics: Kinematics, rollouts: Rollouts, judged_steps: Sequence[int]
+) -> Array:
+    """Computes errors (priors, W, judged steps, e), corrected by what others say."""
+    windows = rollouts.windows
+    shape = len(_PRIORS), len(windows), len(judged_steps), windows.space.error_dim
+    errors = np.empty(shape)
+    for is_own in _parts_of_whole_runs(windows):
+        others = rollouts[~is_own]
         own = rollouts[is_own]
+        corrections = Correction.fit_each(
+            kinematics=kinematics,
+            windows=others.windows,
+            predicted=others.predicted,
+            steps=judged_steps,
+            priors=_PRIORS,
+        )
         for i, correction in enumerate(corrections):
-            corrected = replace(own, predicted=correction(own.windows, own.predicted))
-            distances[i, is_own] = corrected.distances(judged_steps)
-    ratios = distances.mean(axis=1) / without.mean(axis=0)
-    best = np.argmin(ratios, axis=0)
-    return ChosenPenalties(np.array(_PENALTIES)[best], np.min(ratios, axis=0))
+            corrected = correction(own.windows, own.predicted)
+            errors[i, is_own] = own.windows.errors(corrected, judged_steps)
+    return errors
+
+
+def _choose_shares(errors: Array) -> Array:
+    """Chooses the shares (A,) whose average of errors (A, W, e) is shortest."""
+    counts = np.zeros(len(errors))
+    total = np.zeros(errors.shape[1:])
+    least = np.inf
+    for members in range(1, _MEMBERS + 1):
+        lengths = _mean_length((total + errors) / members)
+        best = lengths.argmin()
+        if lengths[best] >= least:
+            break
+        least = lengths[best]
+        counts[best] += 1
+        total = total + errors[best]
+    return counts / counts.sum()
+
+
+def _mean_length(errors: Array) -> Array:
+    """Computes the mean length (...) of errors (..., W, e)."""
+    return np.linalg.norm(errors, axis=-1).mean(axis=-1)
 
 
 def fit_correction(
     kinematics: Kinematics,
     rollouts: Rollouts,
     judged_steps: Sequence[int],
-    penalties: Array,
+    shares: Array,
 ) -> Correction:
     """Fits a correction of rollouts, at all of its steps.
 
     Args:
         kinematics: Of the model.
         rollouts: That are corrected.
-        judged_steps: Those of the penalties.
-        penalties: (judged steps, groups).
+        judged_steps: Those of the shares.
+        shares: Of the corrections that are averaged (priors, judged steps, groups).
     """
     last = rollouts.windows.ahead
     knots = sorted({knot for knot in _KNOTS if knot < last} | {last})
-    (correction,) = _fit_corrections(
-        kinematics=kinematics,
-        rollouts=rollouts,
-        knots=knots,
-        judged_steps=judged_steps,
-        alternatives=[penalties],
-    )
-    return correction
-
-
-def _fit_corrections(
-    kinematics: Kinematics,
-    rollouts: Rollouts,
-    knots: Sequence[int],
-    judged_steps: Sequence[int],
-    alternatives: Sequence[Array],
-) -> list[Correction]:
-    """Fits corrections of rollouts, with each of some penalties.
-
-    Args:
-        kinematics: Of the model.
-        rollouts: That are corrected.
-        knots: Steps of the corrections; each has the penalty of the nearest judged
-            step.
-        judged_steps: Those of the penalties.
-        alternatives: Penalties (judged steps, groups).
-    """
-    judged = np.log(judged_steps)
-    nearest = [np.abs(judged - np.log(knot)).argmin() for knot in knots]
-    entries = [group.error_dim for group in rollouts.windows.space.groups]
-    return Correction.fit_each(
+    corrections = Correction.fit_each(
         kinematics=kinematics,
         windows=rollouts.windows,
         predicted=rollouts.predicted,
         steps=knots,
-        alternatives=[
-            np.repeat(penalties[nearest], entries, axis=1) for penalties in alternatives
-        ],
+        priors=_PRIORS,
     )
+    # Each knot has the shares of the nearest judged step.
+    judged = np.log(judged_steps)
+    nearest = [np.abs(judged - np.log(knot)).argmin() for knot in knots]
+    entries = [group.error_dim for group in rollouts.windows.space.groups]
+    by_entry = np.repeat(shares[:, nearest], entries, axis=2)
+    return Correction.average(corrections, by_entry)
 
 
 def _parts_of_whole_runs(windows: Windows) -> list[np.ndarray]:

@@ -5,7 +5,7 @@
 2. Groups of outputs: those of one nominal structure, the others of another.
 3. GPs on the groups of outputs, from none and from all at once, by the change of one
    group at a time that helps most.
-4. A correction by the past upon the best structures, unless they have a memory.
+4. A correction by the past upon the best structure.
 
 A structure's score is the mean, over groups and steps, of the logarithm of its error
 over that of the best baseline; where it is behind, that counts twice.
@@ -29,7 +29,7 @@ from gpmpc.logs._noise import fit_noise
 from gpmpc.logs._output_gps import train_output_gp
 from gpmpc.logs._rollout_corrections import (
     Rollouts,
-    choose_penalties,
+    choose_averages,
     fit_correction,
 )
 from gpmpc.logs._smoothing import smooth
@@ -41,7 +41,7 @@ from gpmpc.logs._structures import (
     additions,
     bases,
 )
-from gpmpc.models._correction import Correction, StartFilter
+from gpmpc.models._correction import StartFilter
 from gpmpc.models._grouped import GroupedNominal
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel, OutputGP
@@ -53,11 +53,9 @@ _JUDGED = (1, 10, 50)  # steps whose errors decide
 _PIECE = 0.02  # of the score that every piece of a structure has to earn
 _BEAM = 2  # structures that go on, of a round
 _CLOSE = 0.02  # of the best score: where the second one goes on as well
-_FEW = 10_000  # rows of a log, up to which half of them make a worse model
 _WINDOWS = 200  # of a fold, that structures are compared on
-_CORRECTED_WINDOWS = 1200  # of a fold, that a correction is fitted to
+_CORRECTED_WINDOWS = 2400  # that a correction is fitted to
 _LARGEST = 1e6  # state of a rollout that a correction is fitted to
-_CORRECTED = 2  # structures upon which a correction is tried
 _FILTERED_WINDOWS = 4000  # that the filter of starts is fitted to
 _FILTER_PENALTY = 1e-4  # of squared coefficients of the filter of starts, per row
 _EXACT = 1e-4  # of a constant state's error: what is smaller counts as exact
@@ -71,6 +69,14 @@ class _TrainingData(NamedTuple):
 
     log: Log  # smoothed, where its rows are noisy
     start_filter: StartFilter | None  # None where they are not
+
+
+class _Validation(NamedTuple):
+    """Held-out rows, and a model without a correction that was fitted to the others."""
+
+    held_out: Log
+    model: LogModel
+    rollouts: Rollouts  # of the held-out rows
 
 
 class Search:
@@ -117,6 +123,7 @@ class Search:
         self._gps: dict[tuple[str, GroupGP], list[OutputGP]] = {}
         self._structures: dict[str, Structure] = {}
         self._errors: dict[str, Array] = {}
+        self._validations: dict[str, list[_Validation]] = {}
         self._baselines = self._baseline_distances()
         # What models are fitted to, and how their rollouts start, by fold.
         self._training = [self._training_data(fold.train) for fold in folds]
@@ -151,7 +158,7 @@ class Search:
         for start in self._starts_of_gps():
             self._search_gps(start)
         if not self._for_control:
-            self._search_corrections()
+            self._consider_correction(self.best)
 
     def score(self, structure: Structure) -> float:
         """Returns the score of a structure that was considered; smaller is better."""
@@ -404,63 +411,97 @@ class Search:
 
     # 4. corrections by the past
 
-    def _search_corrections(self) -> None:
-        """Considers corrections upon the best structures.
-
-        A memory holds the past already. A correction upon it follows the runs that it
-        was fitted to, and predicts others worse.
-        """
-        if not self.best.model.memory.empty:
-            return
-        ranked = self._ranked(self._structures.values())
-        for structure in ranked[:_CORRECTED]:
-            self._consider_correction(structure)
-
     def _consider_correction(self, structure: Structure) -> None:
-        """Considers a correction with the penalty that is best of each group.
+        """Considers the best average of corrections.
 
-        A structure whose rollouts diverge in all of a fold has none.
+        A structure has none whose rollouts diverge on all that a model was not fitted
+        to.
         """
-        key = replace(structure, penalties=((0.0,),)).key
+        key = replace(structure, shares=(((0.0,),),)).key
         if key not in self._memory:
-            by_fold = self._held_out_rollouts(structure)
-            if not all(len(rollouts.windows) for rollouts in by_fold):
+            parts = [one.rollouts for one in self._validate(structure)]
+            if not all(len(rollouts.windows) for rollouts in parts):
                 return
-            chosen = choose_penalties(
+            averages = choose_averages(
                 kinematics=structure.model.kinematics,
-                rollouts=Rollouts.concatenate(by_fold),
+                rollouts=Rollouts.concatenate(parts),
                 judged_steps=self.judged_steps,
             )
-            errors = self._errors[structure.key] * chosen.ratios
+            errors = self._errors[structure.key] * averages.ratios
             self._memory[key] = {
-                "penalties": chosen.penalties.tolist(),
+                "shares": averages.shares.tolist(),
                 "errors": errors.tolist(),
             }
-        penalties = [tuple(map(float, row)) for row in self._memory[key]["penalties"]]
-        errors = np.array(self._memory[key]["errors"])
-        self._enter(replace(structure, penalties=tuple(penalties)), errors)
-
-    def _held_out_rollouts(self, structure: Structure) -> list[Rollouts]:
-        """Returns rollouts of held-out rows, by the models of the other fold."""
-        rollouts = []
-        for model, fold in zip(self._models(structure), self._folds, strict=True):
-            windows = fold.held_out.windows(
-                self._steps, past=PAST_ROWS, most=_CORRECTED_WINDOWS
-            )
-            with np.errstate(over="ignore", invalid="ignore"):
-                predicted = model.rollout(windows)
-            is_finite = np.abs(predicted).max(axis=(1, 2)) < _LARGEST
-            rollouts.append(Rollouts(windows, predicted)[is_finite])
-        return rollouts
-
-    def _correction(self, structure: Structure, rollouts: Rollouts) -> Correction:
-        """Fits the correction of a structure to rollouts."""
-        return fit_correction(
-            kinematics=structure.model.kinematics,
-            rollouts=rollouts,
-            judged_steps=self.judged_steps,
-            penalties=np.array(structure.penalties),
+        shares = tuple(
+            tuple(tuple(map(float, groups)) for groups in steps)
+            for steps in self._memory[key]["shares"]
         )
+        errors = np.array(self._memory[key]["errors"])
+        self._enter(replace(structure, shares=shares), errors)
+
+    def _validate(self, structure: Structure) -> list[_Validation]:
+        """Fits a structure to parts of the rows, and rolls it out on the others.
+
+        Models of half the rows err more than the one of all. Here three quarters are
+        fitted to, where there are rows enough for windows.
+        """
+        structure = replace(structure, shares=())
+        if structure.key not in self._validations:
+            try:
+                folds = self._quarters()
+                models = [self._fit_to(fold.train, structure).model for fold in folds]
+            except DataError:
+                folds = list(self._folds)
+                models = self._models(structure)
+            self._validations[structure.key] = [
+                _Validation(fold.held_out, model, self._rollouts(model, fold.held_out))
+                for fold, model in zip(folds, models, strict=True)
+            ]
+        return self._validations[structure.key]
+
+    def _quarters(self) -> list[Fold]:
+        """Halves what each fold holds out, every other run or block of it.
+
+        Raises:
+            DataError: One would be without windows.
+        """
+        quarters = []
+        for fold in self._folds:
+            runs = fold.held_out.runs
+            for first in range(2):
+                others = (*fold.train.runs, *runs[1 - first :: 2])
+                quarter = Fold(
+                    train=replace(fold.train, runs=others),
+                    held_out=replace(fold.held_out, runs=runs[first::2]),
+                )
+                quarter.held_out.windows(self._steps, past=PAST_ROWS, most=1)
+                quarters.append(quarter)
+        return quarters
+
+    def _rollouts(self, model: LogModel, held_out: Log) -> Rollouts:
+        """Rolls a model out on held-out rows, and leaves out what diverges."""
+        share = len(held_out) / len(self._log)
+        windows = held_out.windows(
+            self._steps, past=PAST_ROWS, most=round(share * _CORRECTED_WINDOWS)
+        )
+        with np.errstate(over="ignore", invalid="ignore"):
+            predicted = model.rollout(windows)
+        is_finite = np.abs(predicted).max(axis=(1, 2)) < _LARGEST
+        return Rollouts(windows, predicted)[is_finite]
+
+    def _correct(
+        self, model: LogModel, structure: Structure, rollouts: Sequence[Rollouts]
+    ) -> LogModel:
+        """Adds the correction of a structure, fitted to rollouts, if it has one."""
+        if not structure.shares:
+            return model
+        correction = fit_correction(
+            kinematics=model.kinematics,
+            rollouts=Rollouts.concatenate(rollouts),
+            judged_steps=self.judged_steps,
+            shares=np.array(structure.shares),
+        )
+        return replace(model, correction=correction)
 
     # what all of them need
 
@@ -482,13 +523,16 @@ class Search:
             replace(nominal, gps=tuple(trained[i] for trained in gps))
             for i, nominal in enumerate(nominals)
         ]
-        if not structure.penalties:
+        if not structure.shares:
             return models
+        rollouts = [
+            self._rollouts(model, fold.held_out)
+            for model, fold in zip(models, self._folds, strict=True)
+        ]
         # What one fold holds out, the model of the other was fitted to.
-        first, second = self._held_out_rollouts(replace(structure, penalties=()))
         return [
-            replace(model, correction=self._correction(structure, rollouts))
-            for model, rollouts in zip(models, (second, first), strict=True)
+            self._correct(model, structure, [others])
+            for model, others in zip(models, reversed(rollouts), strict=True)
         ]
 
     def _trained(self, structure: Structure, gp: GroupGP) -> list[OutputGP]:
@@ -572,83 +616,34 @@ class Search:
         for structure in self._ranked(self._structures.values()):
             nominal = structure.model.nominal
             is_still = isinstance(nominal, AffineNominal) and not nominal.fitted
-            if structure.base != best.base and not (is_still or structure.penalties):
+            if structure.base != best.base and not (is_still or structure.shares):
                 rivals.setdefault(structure.base, structure)
         return {one.name: self._models(one)[0] for one in rivals.values()}
 
     def fit_noise(self) -> OutputNoise:
-        """Fits the noise of the best structure to held-out runs.
-
-        Models of half the rows err more than the one of all: here three quarters are
-        fitted to, where there are rows enough for windows, and half would be few.
-        """
-        try:
-            folds = self._quarters() if len(self._log) <= _FEW else []
-        except DataError:
-            folds = []
-        if not folds:
-            held_out = [fold.held_out for fold in self._folds]
-            return fit_noise(self._models(self.best), held_out, self._steps)
-        models = [
-            self._fit_best_to(fold.train, rollouts).model for fold, rollouts in folds
-        ]
-        held_out = [fold.held_out for fold, _ in folds]
+        """Fits the noise of the best structure to held-out runs."""
+        validations = self._validate(self.best)
+        models = []
+        for validation in validations:
+            others = [one.rollouts for one in validations if one is not validation]
+            models.append(self._correct(validation.model, self.best, others))
+        held_out = [validation.held_out for validation in validations]
         return fit_noise(models, held_out, self._steps)
-
-    def _quarters(self) -> list[tuple[Fold, Rollouts | None]]:
-        """Halves what each fold holds out, every other run or block of it.
-
-        With them come the rollouts that a correction may be fitted to.
-
-        Raises:
-            DataError: One would be without windows.
-        """
-        rollouts: list[Rollouts] = []
-        if self.best.penalties:
-            rollouts = self._held_out_rollouts(replace(self.best, penalties=()))
-        quarters = []
-        for i, fold in enumerate(self._folds):
-            runs = fold.held_out.runs
-            for first in range(2):
-                quarter = Fold(
-                    train=replace(
-                        fold.train, runs=(*fold.train.runs, *runs[1 - first :: 2])
-                    ),
-                    held_out=replace(fold.held_out, runs=runs[first::2]),
-                )
-                quarter.held_out.windows(self._steps, past=PAST_ROWS, most=1)
-                others = None
-                if rollouts:
-                    own = rollouts[i]
-                    is_other = own.windows.runs % 2 != first
-                    others = Rollouts.concatenate([own[is_other], rollouts[1 - i]])
-                quarters.append((quarter, others))
-        return quarters
 
     def fit_to_all_runs(self) -> NominalFit:
         """Fits the best structure to all runs, its GPs and its correction as well."""
-        rollouts = None
-        if self.best.penalties:
-            uncorrected = replace(self.best, penalties=())
-            rollouts = Rollouts.concatenate(self._held_out_rollouts(uncorrected))
-        return self._fit_best_to(self._log, rollouts)
+        fit = self._fit_to(self._log, self.best)
+        rollouts = [validation.rollouts for validation in self._validate(self.best)]
+        return replace(fit, model=self._correct(fit.model, self.best, rollouts))
 
-    def _fit_best_to(self, log: Log, rollouts: Rollouts | None) -> NominalFit:
-        """Fits the best structure to a log.
-
-        Args:
-            log: The rows.
-            rollouts: That a correction is fitted to; None where it has none.
-        """
-        best = self.best
+    def _fit_to(self, log: Log, structure: Structure) -> NominalFit:
+        """Fits a structure to a log, without its correction."""
         training = _TrainingData(log, None)
-        if best.model.memory.empty:
+        if structure.model.memory.empty:
             training = self._training_data(log)
-        fit = self._fit_nominal_to(training.log, best.nominal)
-        gps = tuple(self._train(gp, fit.model, training.log) for gp in best.gps)
+        fit = self._fit_nominal_to(training.log, structure.nominal)
+        gps = tuple(self._train(gp, fit.model, training.log) for gp in structure.gps)
         model = replace(fit.model, gps=gps, start_filter=training.start_filter)
-        if rollouts is not None:
-            model = replace(model, correction=self._correction(best, rollouts))
         return replace(fit, model=model)
 
     def _fit_nominal_to(self, log: Log, structure: Structure) -> NominalFit:

@@ -89,8 +89,9 @@ class Structure:
     #: structures without GPs, each with the groups of outputs that are its own; none of
     #: a structure that is not put together
     parts: tuple[tuple["Structure", tuple[str, ...]], ...] = ()
-    #: of the correction by the past (judged steps, groups of states); none without
-    penalties: tuple[tuple[float, ...], ...] = ()
+    #: of the corrections by the past whose average it has (priors, judged steps, groups
+    #: of states); none without
+    shares: tuple[tuple[tuple[float, ...], ...], ...] = ()
 
     @property
     def name(self) -> str:
@@ -101,7 +102,7 @@ class Structure:
         if self.gps:
             gps = [f"{gp.group} (averaged over {gp.rows})" for gp in self.gps]
             words.append(f"GP on {_words(gps)}")
-        if self.penalties:
+        if self.shares:
             words.append("corrected by the past")
         return ", ".join(words)
 
@@ -112,7 +113,7 @@ class Structure:
         for part, groups in self.parts:
             words.append(f"({part.key}:{'+'.join(groups)})")
         words += sorted(f"gp:{gp.group}:{gp.rows}" for gp in self.gps)
-        if self.penalties:
+        if self.shares:
             words.append("corrected")
         return "/".join(words)
 
@@ -120,12 +121,12 @@ class Structure:
     def size(self) -> int:
         """Number of the pieces that it is made of, to prefer what is simpler."""
         parts = sum(part.size for part, _ in self.parts)
-        return len(self.additions) + len(self.gps) + parts + bool(self.penalties)
+        return len(self.additions) + len(self.gps) + parts + bool(self.shares)
 
     @property
     def nominal(self) -> "Structure":
         """The structure without GPs and correction."""
-        return replace(self, gps=(), penalties=())
+        return replace(self, gps=(), shares=())
 
     def extended(self, addition: Addition) -> "Structure | None":
         """Returns the structure with an addition; None where that makes no sense."""

@@ -10,10 +10,14 @@ the past is found by a regression for each step, straight from the past to the e
 that far ahead. The movement that was rolled out is among the regressors, so that it can
 be shrunk or left out. Upon a state that does not move this is the ordinary ridge
 regression.
+
+A penalty pulls the coefficients to those of a prior: the rollout as it is, a share of
+its movement, or none of it, which is the start. Corrections with different priors and
+penalties predict best together: their coefficients are averaged.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +31,13 @@ BINS = 5  # means of the inputs to come that it sees
 PENALTY = 0.01  # of squared coefficients of standardised columns, per row
 
 
+class Prior(NamedTuple):
+    """What the coefficients of a correction are pulled to, and how strongly."""
+
+    penalty: float  #: of squared deviations from it, per row; infinite: it is taken
+    movement: float = 1.0  #: share of the predicted movement that it keeps
+
+
 @dataclass(frozen=True)
 class Correction:
     """Linear corrections of rollouts at some steps, and between them."""
@@ -38,58 +49,50 @@ class Correction:
     weights: Array  #: (S, 1 + r, e), the constant first
 
     @classmethod
-    def fit(
-        cls,
-        kinematics: Kinematics,
-        windows: Windows,
-        predicted: Array,
-        steps: Sequence[int],
-        penalties: Array,
-    ) -> "Correction":
-        """Fits regressions to the errors of rollouts; see ``fit_each``."""
-        (correction,) = cls.fit_each(kinematics, windows, predicted, steps, [penalties])
-        return correction
-
-    @classmethod
     def fit_each(
         cls,
         kinematics: Kinematics,
         windows: Windows,
         predicted: Array,
         steps: Sequence[int],
-        alternatives: Sequence[Array],
+        priors: "Sequence[Prior]",
     ) -> list["Correction"]:
-        """Fits regressions to the errors of rollouts, with each of several penalties.
+        """Fits regressions to the errors of rollouts, one for each of several priors.
 
         Args:
             kinematics: Has the features of the start.
             windows: W of them, with ``max(LAGS)`` rows of past or more.
             predicted: Rollouts (W, K, n).
             steps: At which a regression stands.
-            alternatives: Penalties of squared coefficients, per row (S, e); infinite
-                for none.
+            priors: Of the coefficients.
         """
         moments = []
         for step in steps:
             measured = windows.states[:, windows.past + step]
             rollout = predicted[:, step - 1]
             moments.append(_moments(kinematics, windows, rollout, step, measured))
-        corrections = []
-        for penalties in alternatives:
-            weights = [
-                _weights(one, penalty)
-                for one, penalty in zip(moments, penalties, strict=True)
-            ]
-            corrections.append(
-                cls(
-                    kinematics=kinematics,
-                    steps=tuple(steps),
-                    mean=np.array([one.mean for one in moments]),
-                    deviation=np.array([one.deviation for one in moments]),
-                    weights=np.array(weights),
-                )
+        return [
+            cls(
+                kinematics=kinematics,
+                steps=tuple(steps),
+                mean=np.array([one.mean for one in moments]),
+                deviation=np.array([one.deviation for one in moments]),
+                weights=np.array([_weights(one, prior) for one in moments]),
             )
-        return corrections
+            for prior in priors
+        ]
+
+    @staticmethod
+    def average(corrections: "Sequence[Correction]", shares: Array) -> "Correction":
+        """Averages corrections that were fitted to the same rollouts.
+
+        Args:
+            corrections: A of them.
+            shares: Of each, by step and entry of the errors (A, S, e).
+        """
+        weights = np.array([one.weights for one in corrections])
+        averaged = np.einsum("ase,asre->sre", shares, weights)
+        return replace(corrections[0], weights=averaged)
 
     def __call__(self, windows: Windows, predicted: Array) -> Array:
         """Corrects rollouts (W, K, n); linear between its steps, constant after."""
@@ -111,10 +114,8 @@ class Correction:
     def _at(self, i: int, windows: Windows, predicted: Array) -> Array:
         """Computes the corrections (W, e) of states (W, n) at one of its steps."""
         regressors = _regressors(self.kinematics, windows, predicted, self.steps[i])
-        return (
-            _standardized(regressors, self.mean[i], self.deviation[i])
-            @ (self.weights[i])
-        )
+        z = _standardized(regressors, self.mean[i], self.deviation[i])
+        return z @ self.weights[i]
 
 
 @dataclass(frozen=True)
@@ -140,8 +141,7 @@ class StartFilter:
         """
         start = windows.states[:, windows.past]
         moments = _moments(kinematics, windows, start, 0, states)
-        penalties = np.full(windows.space.error_dim, penalty)
-        weights = _weights(moments, penalties)
+        weights = _weights(moments, Prior(penalty))
         return cls(kinematics, moments.mean, moments.deviation, weights)
 
     def __call__(self, windows: Windows) -> Array:
@@ -178,15 +178,29 @@ def _moments(
     return _Moments(mean, deviation, z.T @ z, z.T @ errors, len(z))
 
 
-def _weights(moments: _Moments, penalties: Array) -> Array:
-    """Computes the weights (1 + r, e) with penalties (e,)."""
-    weights = np.zeros_like(moments.with_errors)
+def _weights(moments: _Moments, prior: Prior) -> Array:
+    """Computes the weights (1 + r, e) with a prior."""
+    expected = _expected_weights(moments, prior.movement)
+    if np.isinf(prior.penalty):
+        return expected
     is_penalized = np.diag(np.r_[0.0, np.ones(len(moments.mean))])
-    for penalty in np.unique(penalties[np.isfinite(penalties)]):
-        columns = penalties == penalty
-        penalized = moments.normal + penalty * moments.rows * is_penalized
-        solution: Any = np.linalg.solve(penalized, moments.with_errors[:, columns])
-        weights[:, columns] = solution
+    penalized = moments.normal + prior.penalty * moments.rows * is_penalized
+    missed = moments.with_errors - moments.normal @ expected
+    solution: Any = np.linalg.solve(penalized, missed)
+    return expected + solution
+
+
+def _expected_weights(moments: _Moments, movement: float) -> Array:
+    """Returns the weights (1 + r, e) that keep a share of the movement, and no more.
+
+    The movement is in the last regressors. What is taken off it is taken off its mean,
+    by the constant, and off its standardised rest.
+    """
+    weights = np.zeros_like(moments.with_errors)
+    entries = weights.shape[1]
+    taken_off = movement - 1.0
+    weights[0] = taken_off * moments.mean[-entries:]
+    weights[-entries:] = np.diag(taken_off * moments.deviation[-entries:])
     return weights
 
 

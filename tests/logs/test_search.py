@@ -13,10 +13,10 @@ from gpmpc.logs._comparison import compare
 from gpmpc.logs._control_fitness import judge_for_control
 from gpmpc.logs._folds import split_folds
 from gpmpc.logs._log import LogRun
-from gpmpc.logs._rollout_corrections import Rollouts, choose_penalties
+from gpmpc.logs._rollout_corrections import Rollouts, choose_averages
 from gpmpc.logs._smoothing import smooth
 from gpmpc.models import LogModel
-from gpmpc.models._correction import Correction
+from gpmpc.models._correction import Correction, Prior
 from gpmpc.models._kinematics import Increments
 from gpmpc.models._parametric import AffineNominal
 
@@ -154,39 +154,84 @@ def test_a_correction_upon_a_still_state_is_a_regression():
     kinematics = Increments(log.space)
     windows = log.windows(10, past=20)
     still = np.repeat(windows.states[:, 20:21], 10, axis=1)
-    correction = Correction.fit(
-        kinematics, windows, still, (1, 10), np.full((2, 2), 1e-6)
+    correction, free = Correction.fit_each(
+        kinematics, windows, still, (1, 10), [Prior(1e-6), Prior(np.inf)]
     )
     corrected = correction(windows, still)
-    free = Correction.fit(kinematics, windows, still, (10,), np.full((1, 2), np.inf))
     np.testing.assert_array_equal(free(windows, still)[:, -1], still[:, -1])
     error = [
         np.square(windows.states[:, 30] - states[:, -1]).mean()
         for states in (corrected, still)
     ]
     assert error[0] < 0.2 * error[1]
+    shares = np.full((2, 2, 2), [[[0.25]], [[0.75]]])
+    averaged = Correction.average([correction, free], shares)(windows, still)
+    quarter = 0.25 * corrected + 0.75 * still
+    np.testing.assert_allclose(averaged, quarter, rtol=0, atol=1e-12)
     between = correction(windows, still)[:, 4] - still[:, 4]  # 5 of 1 to 10 steps
     ends = correction(windows, still) - still
     expected = ends[:, 0] + (ends[:, 9] - ends[:, 0]) * 4 / 9
     np.testing.assert_allclose(between, expected, atol=1e-12)
 
 
+def test_a_correction_keeps_a_share_of_the_movement():
+    log = reactor_log(400)
+    windows = log.windows(10, past=20)
+    start = windows.states[:, 20:21]
+    predicted = start + np.random.default_rng(0).normal(size=(len(windows), 10, 2))
+    half, none, near_none = Correction.fit_each(
+        kinematics=Increments(log.space),
+        windows=windows,
+        predicted=predicted,
+        steps=(1, 10),
+        priors=[Prior(np.inf, 0.5), Prior(np.inf, 0.0), Prior(1e9, 0.0)],
+    )
+    movement = predicted[:, -1:] - start
+    for correction, share in ((half, 0.5), (none, 0.0)):
+        corrected = correction(windows, predicted)[:, -1:]
+        np.testing.assert_allclose(corrected, start + share * movement, atol=1e-12)
+    # A large penalty leaves the constant, which is the mean error of the prior.
+    measured = windows.states[:, 30:31]
+    corrected = near_none(windows, predicted)[:, -1:]
+    expected = start + (measured - start).mean(axis=0)
+    np.testing.assert_allclose(corrected, expected, atol=1e-6)
+
+
+def test_averages_take_what_is_best_on_other_runs():
+    log = log_of(
+        [np.random.default_rng(i).normal(size=(100, 2)) for i in range(6)],
+        [np.zeros((100, 1))] * 6,
+    )
+    windows = log.windows(10, past=20)
+    measured = windows.states[:, 21:]
+    errors = np.random.default_rng(9).normal(size=measured.shape)
+
+    def ratios(rollouts):
+        kinematics = Increments(log.space)
+        return choose_averages(kinematics, Rollouts(windows, rollouts), (1, 10)).ratios
+
+    # What is exact stays; of what only errs, less than the rest is kept.
+    np.testing.assert_allclose(ratios(measured), 1.0)
+    assert (ratios(measured + 10 * errors) < 0.2).all()
+
+
 def test_what_runs_have_each_for_themselves_is_not_corrected():
     rng = np.random.default_rng(1)
     levels = rng.normal(size=(6, 2))
-    states = [level + 0.01 * rng.normal(size=(100, 2)) for level in levels]
+    # A constant state is no better than the rollouts.
+    states = [level + 10 * rng.normal(size=(100, 2)) for level in levels]
     log = log_of(states, [np.full((100, 1), level) for level in rng.normal(size=6)])
     windows = log.windows(10, past=20)
     measured = windows.states[:, 21:]
 
-    def penalties(errors):
+    def averages(errors):
         rollouts = Rollouts(windows, measured + errors)
-        return choose_penalties(Increments(log.space), rollouts, (1, 10))
+        return choose_averages(Increments(log.space), rollouts, (1, 10))
 
-    own = penalties(rng.normal(size=(6, 1, 2))[windows.runs])
+    own = averages(rng.normal(size=(6, 1, 2))[windows.runs])
     assert (own.ratios > 0.8).all()
-    common = penalties(np.ones((len(windows), 1, 2)))
-    assert np.isfinite(common.penalties).all()
+    common = averages(np.ones((len(windows), 1, 2)))
+    np.testing.assert_allclose(common.shares.sum(axis=0), 1.0)
     assert (common.ratios < 0.1).all()
 
 
