@@ -24,8 +24,8 @@ from gpmpc.logs._fitting import NominalFit
 from gpmpc.logs._learning import IdentifiedModel
 from gpmpc.logs._structures import Candidate
 from gpmpc.models import load_model
-from gpmpc.models._log_dynamics import LogDynamics
 from gpmpc.models._older_files import signals_of_metadata
+from gpmpc.models._past import measured_dim
 from gpmpc.models._stored_log_model import (
     LOG_MODEL,
     NamedLogModel,
@@ -143,11 +143,9 @@ class SavedModel:
     def check(self, system: System) -> None:
         """Raises ``SettingError`` unless signals and time step are a system's."""
         model = self.model
-        if isinstance(model, LogDynamics) and model.carried_dim:
-            rule = f"looks back {model.model.past} rows, which a flight does not keep"
-            raise SettingError("model", f"{self.path} {rule}: learn it --for-control")
         signals = self.signals
-        self._check_size("states", model.state_dim, signals.state_names, system)
+        measured = measured_dim(model)
+        self._check_size("states", measured, signals.state_names, system)
         self._check_size("inputs", model.input_dim, signals.input_names, system)
         signals.check(self.path, system.signals, system.name, "model")
 

@@ -77,7 +77,7 @@ class GroupGP(NamedTuple):
     rows: int  # over which its targets are averaged
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Structure:
     """A form of a model, without the values of its parameters."""
 

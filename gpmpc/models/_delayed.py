@@ -11,9 +11,10 @@ from torch import Tensor
 
 from gpmpc._arrays import read_array
 from gpmpc._calls import explains_arguments
-from gpmpc._dynamics import DynamicsModel, check_next_states
+from gpmpc._dynamics import Array, DynamicsModel, check_next_states
 from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.gaussian import Gaussian
+from gpmpc.models._past import has_past, measured_dim
 from gpmpc.models._wrapper import LinearPart, LinearWrapper
 from gpmpc.signals import signals_of
 
@@ -73,6 +74,38 @@ class DelayedModel(LinearWrapper):
     def state_dim(self) -> int:
         """Number of states, n + D m."""
         return self.model.state_dim + self.pending * self.model.input_dim
+
+    @property
+    def measured_dim(self) -> int:
+        """Number of the states that are measured: those of the model."""
+        return measured_dim(self.model)
+
+    def at_rest(self, measured: Array, input: Array) -> Array:
+        """Returns the state (n + D m,) of a plant that stood where it is measured.
+
+        Args:
+            measured: (measured_dim,).
+            input: That was applied all the time (m,).
+        """
+        state = measured
+        if has_past(self.model):
+            state = self.model.at_rest(measured, input)
+        return np.concatenate([state, np.tile(input, self.pending)])
+
+    def follow(self, state: Array, input: Array, measured: Array) -> Array:
+        """Returns the state (n + D m,) that a measurement says.
+
+        Args:
+            state: That of the step before (n + D m,).
+            input: That was applied there (m,).
+            measured: What it led to (measured_dim,).
+        """
+        n = self.model.state_dim
+        after = measured
+        if has_past(self.model):
+            Z, W, _, _ = self.linear_part
+            after = self.model.follow(state[:n], Z @ state + W @ input, measured)
+        return np.concatenate([after, state[n + self.input_dim :], input])
 
     @property
     def noise_covariance(self) -> Tensor:

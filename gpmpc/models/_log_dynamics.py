@@ -3,13 +3,13 @@
     x[k+1] = kinematics.step(x[k], y(x[k], u[k]))
 
 Where inputs act late, through lags, or past rows are remembered, the state holds that
-as well, behind what is measured; ``augmented`` fills it with what was measured.
-Derivatives are central differences, all points in one batch. The disturbance from the
-past is left to the controller's own estimate.
+as well, behind what is measured: a loop begins with ``at_rest`` and goes on with
+``follow`` (``gpmpc.models._past``). The disturbance from the past is left to the
+controller's own estimate.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -21,16 +21,16 @@ from gpmpc._arrays import read_array
 from gpmpc._dynamics import Array, Linearized, check_query, to_array
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
+from gpmpc.models._log_linearization import DIFFERENCE, LogLinearizer
 from gpmpc.models._log_model import LogModel
-from gpmpc.models._windows import Windows
 from gpmpc.signals import UNKNOWN, Signals
 
 #: of the coloured noise of outputs [s]; zero is white
 TIME_CONSTANTS = (0.0, 0.05, 0.25, 1.0)
-DIFFERENCE = 1e-5  # of central differences, relative to entries above one
+_NO_CONTEXT = np.empty(0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OutputNoise:
     """Variances of the sources of the errors of a model of outputs."""
 
@@ -39,7 +39,7 @@ class OutputNoise:
     measurement: Array  #: of each entry of a difference of states (e,), likewise
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LogDynamics:
     """A model of a log as a ``DynamicsModel``.
 
@@ -59,11 +59,18 @@ class LogDynamics:
         reason = ""
         if getattr(self.model.nominal, "feedback", False):
             reason = "holds the feedback of the controller that flew"
-        elif not (self.model.gps or getattr(self.model.nominal, "fitted", True)):
+        elif not self._sees_inputs:
             reason = "moves in the same way whatever the inputs are"
         if reason:
             rule = "which no controller can plan with: gpmpc learn --for-control"
             raise SettingError("model", f"{reason}, {rule}")
+
+    @property
+    def _sees_inputs(self) -> bool:
+        """Whether any part of the model is a function of the inputs."""
+        model = self.model
+        learned = bool(model.gps) or bool(model.weights.any())
+        return learned or getattr(model.nominal, "fitted", True)
 
     @property
     def measured_dim(self) -> int:
@@ -85,11 +92,29 @@ class LogDynamics:
 
     output_dim = state_dim
 
+    def at_rest(self, measured: Array, input: Array) -> Array:
+        """Returns the state (n,) of a plant that stood where it is first measured.
+
+        Args:
+            measured: (measured_dim,).
+            input: That was applied all the time (m,).
+        """
+        return self.model.at_rest(measured, input, _NO_CONTEXT)
+
+    def follow(self, state: Array, input: Array, measured: Array) -> Array:
+        """Returns the state (n,) that a measurement says.
+
+        Args:
+            state: That of the step before (n,).
+            input: That was applied there (m,).
+            measured: What it led to (measured_dim,).
+        """
+        return self.model.follow(state, input, measured, _NO_CONTEXT, self.time_step)
+
     def augmented(self, states: Array, inputs: Array) -> Array:
         """Returns the state (n,) after measured rows.
 
-        Where there are fewer rows than the model looks back, it was at rest before
-        them: as in the first row.
+        Before the first of them it was at rest.
 
         Args:
             states: Measured states, the last one that of now (P + 1, measured_dim).
@@ -105,30 +130,11 @@ class LogDynamics:
         if not count or (states.shape, inputs.shape) != shapes:
             rule = "states (P + 1, n) and inputs (P, m) must be rows of one flight"
             raise ShapeError(f"{rule}; got {states.shape} and {inputs.shape}")
-        past = self.model.past
-        missing = max(past - len(inputs), 0)
-        first_input = inputs[:1] if len(inputs) else np.zeros((1, self.input_dim))
-        states = np.concatenate([np.repeat(states[:1], missing, axis=0), states])
-        inputs = np.concatenate([np.repeat(first_input, missing, axis=0), inputs])
-        states = states[-past - 1 :]
-        inputs = inputs[len(inputs) - past :]
-        window = Windows(
-            space=self.model.kinematics.space,
-            time_step=self.time_step,
-            past=past,
-            stride=1,
-            states=states[None],
-            inputs=np.concatenate([inputs, inputs[-1:]])[None],
-            context=np.empty((1, past + 1, 0)),
-            runs=np.zeros(1),
-            times=np.zeros(1),
-        )
-        return self._unfiltered.recall(window)[0]
-
-    @cached_property
-    def _unfiltered(self) -> LogModel:
-        """The model that begins where it is measured: a loop filters by itself."""
-        return replace(self.model, start_filter=None)
+        first_input = inputs[0] if len(inputs) else np.zeros(self.input_dim)
+        state = self.at_rest(states[0], first_input)
+        for input, measured in zip(inputs, states[1:], strict=True):
+            state = self.follow(state, input, measured)
+        return state
 
     @property
     def angles(self) -> Sequence[int]:
@@ -172,26 +178,20 @@ class LogDynamics:
     def linearize(
         self, states: Array, inputs: Array, covariance: bool = True
     ) -> Linearized:
-        """Linearises at K points (K, n), (K, m) by central differences, all at once."""
-        n = self.state_dim
-        K = len(states)
-        z = np.concatenate([states, inputs], axis=1)
-        d = z.shape[1]
-        h = DIFFERENCE * np.maximum(np.abs(z), 1.0)  # (K, d)
-        directions = np.concatenate([np.eye(d), -np.eye(d)])[:, None]
-        displaced = (z + directions * h).reshape(-1, d)
-        values = self._mean(displaced[:, :n], displaced[:, n:]).reshape(2, d, K, n)
-        slopes = (values[0] - values[1]) / (2 * h.T[..., None])
-        J = np.moveaxis(slopes, 0, -1)  # (K, n, d)
-        V = None
-        if covariance:
-            V = self._covariance(states, inputs)
-        return Linearized(
-            mean=self._mean(states, inputs),
-            A=np.ascontiguousarray(J[..., :n]),
-            B=np.ascontiguousarray(J[..., n:]),
-            covariance=V,
-        )
+        """Linearises at K points (K, n), (K, m), all at once."""
+        states = np.asarray(states)
+        inputs = np.asarray(inputs)
+        local = self._linearizer(states, inputs, covariance)
+        mean = local.mean + full_turns(states - local.mean, self.angles)
+        return local._replace(mean=mean)
+
+    @cached_property
+    def _linearizer(self) -> LogLinearizer:
+        return LogLinearizer(self.model, self.input_dim, self.time_step)
+
+    def predict_mean(self, states: Array, inputs: Array) -> Array:
+        """Computes the means of the next states (K, n); see ``linearize``."""
+        return self._mean(states, inputs)
 
     def _mean(self, z: Array, u: Array) -> Array:
         """Computes the mean of the next states (K, n)."""
@@ -212,23 +212,11 @@ class LogDynamics:
 
     def _covariance(self, z: Array, u: Array) -> Array:
         """Computes the covariance of the next states (K, n, n), by that of the GPs."""
-        model = self.model
-        K = len(z)
-        if not model.gps:
-            return np.zeros((K, self.state_dim, self.state_dim))
-        no_context = np.empty((K, 0))
-        points = model.seen_by_gps(z, u, no_context, self.time_step)
-        o = len(model.history)
-        V = np.zeros((K, o, o))
-        for gp, seen in zip(model.gps, points, strict=True):
-            block = np.ix_(range(K), gp.outputs, gp.outputs)
-            prediction = gp.posterior.linearize(
-                np.ascontiguousarray(seen), no_context, covariance=True
-            )
-            assert prediction.covariance is not None
-            V[block] += prediction.covariance
-        B = self._derivatives_by_outputs(z, u)
-        return B @ V @ B.mT
+        if not self.model.gps:
+            return np.zeros((len(z), self.state_dim, self.state_dim))
+        covariance = self._linearizer(z, u, True).covariance
+        assert covariance is not None
+        return covariance
 
     def _derivatives_by_outputs(self, z: Array, u: Array) -> Array:
         """Computes the derivatives of the next states by the outputs (K, n, o)."""

@@ -61,7 +61,17 @@ class StateParts(NamedTuple):
     memory: Array  # s (..., s)
 
 
-@dataclass(frozen=True)
+class _ActingState(NamedTuple):
+    """A state in a step, the inputs that act there, and what follows from them."""
+
+    states: Array  # x (..., n)
+    memory: Array  # s (..., s)
+    inputs: Array  # as they act (..., m)
+    next_lagged: Array  # of first-order lags, after the step (..., m or 0)
+    next_pending: Array  # inputs on their way, after the step (..., D m)
+
+
+@dataclass(frozen=True, eq=False)
 class LogModel:
     """A model of the outputs behind a log: a nominal part and what is learned on it.
 
@@ -244,48 +254,111 @@ class LogModel:
             theta: Parameters, one array each, instead of the model's own.
             time_constants: Of the inputs (..., m) [s], instead of the model's own.
         """
+        now = self._acting_now(carried, inputs, time_step, time_constants)
+        states = now.states
+        context = np.broadcast_to(context, (*states.shape[:-1], context.shape[-1]))
+        learned = self.learned_outputs(states, now.inputs, context, now.memory)
+        learned = learned + disturbance
+        outputs = self.nominal_outputs(states, now.inputs, context, theta) + learned
+        after = self.kinematics.step(states, outputs, time_step)
+        learned = np.broadcast_to(learned, outputs.shape)
+        return self._carry_on(now, after, context, learned)
+
+    def follow(
+        self,
+        carried: Array,
+        inputs: Array,
+        measured: Array,
+        context: Array,
+        time_step: float,
+    ) -> Array:
+        """Returns measured states with all that is carried on, a step later.
+
+        Args:
+            carried: States a step before, with what is carried on (..., n + ...).
+            inputs: Those that were commanded there (..., m).
+            measured: The states that they led to (..., n).
+            context: (..., c).
+            time_step: [s].
+        """
+        now = self._acting_now(carried, inputs, time_step)
+        context = np.broadcast_to(context, (*measured.shape[:-1], context.shape[-1]))
+        outputs = self.kinematics.outputs(now.states, measured, time_step)
+        modelled = self.nominal_outputs(now.states, now.inputs, context)
+        return self._carry_on(now, measured, context, outputs - modelled)
+
+    def at_rest(self, states: Array, inputs: Array, context: Array) -> Array:
+        """Returns a state with all that is carried on, as if it had stood there.
+
+        Of the outputs it is remembered that the nominal part was right.
+
+        Args:
+            states: (n,).
+            inputs: That were commanded all the time (m,).
+            context: (c,).
+        """
+        lagged = inputs if len(self.time_constants) else np.empty(0)
+        memory = np.empty(0)
+        if not self.memory.empty:
+            features = self.features(states, inputs, context)
+            no_outputs = np.zeros((1, len(self.history)))
+            memory = self.memory.begin(features[None], no_outputs)
+        return np.concatenate([states, lagged, np.tile(inputs, self.lag), memory])
+
+    def _acting_now(
+        self,
+        carried: Array,
+        inputs: Array,
+        time_step: float,
+        time_constants: Any = None,
+    ) -> "_ActingState":
+        """Returns the inputs that act in a step, beside the parts of a state."""
         m = inputs.shape[-1]
         parts = self.parts(carried, m)
-        batch = carried.shape[:-1]
-        inputs = np.broadcast_to(inputs, (*batch, m))
-        context = np.broadcast_to(context, (*batch, context.shape[-1]))
+        inputs = np.broadcast_to(inputs, (*carried.shape[:-1], m))
         queue = np.concatenate([parts.pending, inputs], axis=-1)
-        acting, lagged = self._act(parts, queue[..., :m], time_step, time_constants)
-        memory = parts.memory
-        states = parts.states
-        learned = self.learned_outputs(states, acting, context, memory) + disturbance
-        outputs = self.nominal_outputs(states, acting, context, theta) + learned
-        after = self.kinematics.step(states, outputs, time_step)
-        if not self.memory.empty:
-            features = self.features(states, acting, context)
-            learned = np.broadcast_to(learned, outputs.shape)
-            memory = self.memory.step(memory, features, learned)
-        return np.concatenate([after, lagged, queue[..., m:], memory], axis=-1)
+        acting = queue[..., :m]
+        lagged = parts.lagged
+        if len(self.time_constants):
+            lags = self.lags(time_step, time_constants)
+            lagged = lags.after(parts.lagged, acting)
+            acting = lags.acting(parts.lagged, acting)
+        return _ActingState(
+            states=parts.states,
+            memory=parts.memory,
+            inputs=acting,
+            next_lagged=lagged,
+            next_pending=queue[..., m:],
+        )
 
-    def _act(
-        self, parts: StateParts, inputs: Array, time_step: float, time_constants: Any
-    ) -> tuple[Array, Array]:
-        """Returns the inputs as they act in a step, and the lags' state after it."""
-        if not len(self.time_constants):
-            return inputs, parts.lagged
+    def _carry_on(
+        self, now: "_ActingState", after: Array, context: Array, learned: Array
+    ) -> Array:
+        """Returns next states with all that is carried on.
+
+        Args:
+            now: The step.
+            after: Next states (..., n).
+            context: (..., c).
+            learned: What the nominal part left of the outputs (..., o).
+        """
+        memory = now.memory
+        if not self.memory.empty:
+            features = self.features(now.states, now.inputs, context)
+            memory = self.memory.step(memory, features, learned)
+        parts = [after, now.next_lagged, now.next_pending, memory]
+        return np.concatenate(parts, axis=-1)
+
+    def lags(self, time_step: float, time_constants: Any = None) -> FirstOrderLags:
+        """Returns the first-order lags, discretised.
+
+        Args:
+            time_step: [s].
+            time_constants: Of the inputs (..., m) [s], instead of the model's own.
+        """
         if time_constants is None:
             time_constants = self.time_constants
-        lags = FirstOrderLags.of(time_constants, time_step)
-        return lags.acting(parts.lagged, inputs), lags.after(parts.lagged, inputs)
-
-    def seen_by_gps(
-        self, carried: Array, inputs: Array, context: Array, time_step: float
-    ) -> list[Array]:
-        """Returns what each GP sees (..., d) in a step; see ``step``."""
-        m = inputs.shape[-1]
-        parts = self.parts(carried, m)
-        queue = np.concatenate([parts.pending, inputs], axis=-1)
-        acting, _ = self._act(parts, queue[..., :m], time_step, None)
-        features = self.features(parts.states, acting, context)
-        if not any(gp.sees_memory for gp in self.gps):
-            return [features] * len(self.gps)
-        regressors = self.memory.regressors(features, parts.memory)[..., :-1]
-        return [regressors if gp.sees_memory else features for gp in self.gps]
+        return FirstOrderLags.of(time_constants, time_step)
 
     def acting_inputs(
         self, windows: Windows, rows: slice, time_constants: Any = None
@@ -306,9 +379,7 @@ class LogModel:
         if not len(self.time_constants):
             acting = delayed[:, rows.start - self.lag :]
             return acting, np.empty((len(windows), 0))
-        if time_constants is None:
-            time_constants = self.time_constants
-        lags = FirstOrderLags.of(time_constants, windows.time_step)
+        lags = self.lags(windows.time_step, time_constants)
         acting, lagged = lags.filter(delayed)
         return acting[..., rows.start - self.lag :, :], lagged
 

@@ -271,6 +271,13 @@ class Decision:
         return float(self.solution.violation().max(initial=0.0))
 
 
+def model_of(controller: Any) -> Any:
+    """Returns the model that a controller predicts with; None where it has none."""
+    steering = getattr(controller, "controller", controller)  # of one around another
+    prediction = getattr(steering, "prediction", None)
+    return getattr(steering, "model", None) or getattr(prediction, "model", None)
+
+
 class Controller(Protocol):
     """A feedback law with a look-ahead."""
 

@@ -7,6 +7,7 @@ Z = [J, e]' W [J, e] and e = y(z') - J z' - c.
 
 import inspect
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Literal, NamedTuple
@@ -288,6 +289,46 @@ def expand_function(
     expansion = Expansion(values, jacobians[0], by_input)
     _check_finite(name, expansion, states, inputs)
     return expansion
+
+
+def of_first_states(function: Any, n: int, states: int) -> Any:
+    """Returns a function of more states that calls one of the first n of them.
+
+    Args:
+        function: Of tensors, or a CasADi function; see ``LeastSquares``.
+        n: Number of states that it takes.
+        states: Number of states that the new one takes.
+    """
+    if hasattr(function, "n_in"):
+        return _casadi_function_of_first(function, n, states)
+    return _FunctionOfFirst(function, n)
+
+
+class _FunctionOfFirst:
+    """A user's function of tensors of the first n states."""
+
+    def __init__(self, function: Any, n: int):
+        self._function = function
+        self._n = n
+        with suppress(ValueError):  # such as of torch.sin
+            self.__signature__ = inspect.signature(function)
+
+    def __call__(self, states: torch.Tensor, *others: torch.Tensor) -> Any:
+        """Returns the function's values."""
+        return self._function(states[:, : self._n], *others)
+
+
+def _casadi_function_of_first(function: Any, n: int, states: int) -> Any:
+    """Returns a CasADi function of more states that calls one of the first n."""
+    import casadi
+
+    state = casadi.MX.sym("state", states)
+    others = [
+        casadi.MX.sym(function.name_in(i), *function.size_in(i))
+        for i in range(1, function.n_in())
+    ]
+    arguments = [state, *others]
+    return casadi.Function(function.name(), arguments, [function(state[:n], *others)])
 
 
 class _CheckedFunction:

@@ -102,7 +102,7 @@ class Foresight:
 
     def __init__(self, controller: GPMPC):
         self.controller = controller
-        self.meter = StageMeter(controller.problem, controller.horizon)
+        self.meter = StageMeter(controller.prediction.problem, controller.horizon)
         self.longest = max(_HORIZONS * controller.horizon, _STAGES)
         self._model = controller.prediction.model
         self._roll_out = RollOut(self._model)
@@ -123,14 +123,14 @@ class Foresight:
         None where its problem is of this one.
         """
         controller = self.controller
-        constraints = controller.problem.constraints
+        constraints = controller.prediction.problem.constraints
         if any(constraint.stages is not None for constraint in constraints):
             return None
         try:
             return GPMPC(
                 self._model,
                 controller.prediction.propagator,
-                controller.problem,
+                controller.prediction.problem,
                 horizon,
                 controller.initial_input.tolist(),
                 prediction=controller.prediction.settings,
@@ -212,8 +212,8 @@ class Foresight:
         is, and pump.
         """
         controller = self.controller
-        m = controller.problem.input_dim
-        lower, upper = (side[0] for side in controller.problem.inputs.sides)
+        m = controller.prediction.problem.input_dim
+        lower, upper = (side[0] for side in controller.prediction.problem.inputs.sides)
         pushed = np.flatnonzero(np.isfinite(upper - lower))
         for j, i, sign in product(pushed, range(len(state)), (1.0, -1.0)):
             gains = np.zeros((self.longest, m, len(state)))
@@ -265,7 +265,7 @@ class Foresight:
         follow ``states`` (L + 1, n) and ``inputs`` (L, m) with ``gains`` (L, m, n).
         """
         length = len(inputs)
-        problem = self.controller.problem
+        problem = self.controller.prediction.problem
         lower, upper = (held(side, length) for side in problem.inputs.sides)
         down, up = (held(side, length) for side in problem.input_rates.sides)
         law = Feedback(
@@ -289,7 +289,7 @@ class Foresight:
         local = linearize(
             self._model, flight.states[:-1], flight.inputs, covariance=False
         )
-        cost = self.controller.problem.cost
+        cost = self.controller.prediction.problem.cost
         gains = finite_horizon_lqr.unchecked(
             np.ascontiguousarray(local.A),
             np.ascontiguousarray(local.B),
@@ -325,7 +325,7 @@ class Foresight:
         targets = np.asarray(whole.reference.states)
         state = flight.states[0]
         last = no_plan(question.previous_input, len(state), length)
-        angles = controller.problem.cost.angle_indices
+        angles = controller.prediction.problem.cost.angle_indices
         for _ in range(rounds):
             turns = full_turns(flight.states - targets, angles)
             plan = controller.control(

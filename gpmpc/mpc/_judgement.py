@@ -33,7 +33,7 @@ import numpy as np
 from gpmpc._dynamics import to_array
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.mpc import _flight_checks as checks
-from gpmpc.mpc._controller import Decision
+from gpmpc.mpc._controller import Decision, model_of
 from gpmpc.mpc._cost import Tracking
 from gpmpc.mpc.problem import Problem
 from gpmpc.signals import signals_of
@@ -164,7 +164,10 @@ class FlightJudge:
         if names is None:
             signals = signals_of(controller)
             names = (signals.state_names, signals.input_names)
-        return cls(problem, _learned_noise(controller), names)
+        noise = _learned_noise(controller)
+        if noise is not None:  # of a model with a past more than what is measured
+            noise = noise[: problem.state_dim]
+        return cls(problem, noise, names)
 
     def judge(
         self, measured: Array, reference: Array, decision: Decision | None
@@ -232,7 +235,7 @@ def _learned_noise(controller: Any) -> Array | None:
     """
     steering = getattr(controller, "controller", controller)  # of one that learns
     prediction = getattr(steering, "prediction", None)
-    model = getattr(steering, "model", None) or getattr(prediction, "model", None)
+    model = model_of(controller)
     try:
         noise = getattr(model, "noise_covariance", None)
     except UnsupportedModel:  # it depends on the state

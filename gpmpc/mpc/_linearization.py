@@ -46,6 +46,7 @@ from gpmpc._kernels.linalg import copy_matrix, dot, product
 from gpmpc.exceptions import SettingError, check_choice, check_number
 from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
 from gpmpc.models import RollOut
+from gpmpc.models._past import measured_dim
 from gpmpc.mpc._constraints import ConstraintRows, largest_violation
 from gpmpc.mpc._controller import Decision, Request, check_controller, check_method
 from gpmpc.mpc._cost import PENALIZED, by_stage
@@ -181,16 +182,21 @@ class PredictionModel:
         settings: PredictionSettings,
     ):
         states, inputs = check_next_states(model)
+        weighed = states
+        if getattr(problem, "state_dim", states) == measured_dim(model):
+            weighed = measured_dim(model)
         names = signals_of(model).input_names
         self.initial_input = check_controller(
-            problem, states, inputs, horizon, initial_input, names
+            problem, weighed, inputs, horizon, initial_input, names
         )
         check_method("propagator", propagator, "propagate", "Linearization()")
         if not isinstance(settings, PredictionSettings):
             rule = "must be PredictionSettings(...)"
             raise SettingError("prediction", f"{rule}; got {type(settings).__name__}")
         self.propagator = propagator
-        problem = problem.with_angles(angles_of(model))
+        #: as it was handed over: of all states, or of those that are measured
+        self.stated_problem = problem.with_angles(angles_of(model))
+        problem = self.stated_problem.over(states)
         self.problem = problem
         self.state_dim = problem.state_dim
         self.input_dim = problem.input_dim

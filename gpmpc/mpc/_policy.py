@@ -45,6 +45,7 @@ from gpmpc.mpc._controller import (
     read_reference,
 )
 from gpmpc.mpc._judgement import FlightJudge, Judgement
+from gpmpc.mpc._past import Situation
 from gpmpc.mpc.problem import Problem
 from gpmpc.signals import UNKNOWN, signals_of
 from gpmpc.status import Status
@@ -70,6 +71,9 @@ class Command:
     #: the last applicable decision, shifted to this step; before the first one that is
     #: not, with what was applied as its ``input``; None where nothing was
     plan: Decision | None
+    #: that the step began in (n,), of a model whose state holds its past; None of
+    #: others. ``plan`` is of this state, ``decision`` of what is measured of it
+    state: np.ndarray | None = None
 
     @property
     def failed(self) -> bool:
@@ -113,11 +117,27 @@ def decide(
         options["parameters"] = parameters
     if plan is not None:
         options["plan"] = plan
+    situation = _situation(controller, belief, reference, last)
     decision = None
-    if _is_finite(belief):
+    if _is_finite(situation.belief):
         previous = None if last is None else last.plan
-        decision = controller.control(belief, reference, previous, **options)
-    return _conclude(controller, decision, reference, last, on_failure, step)
+        decision = controller.control(
+            situation.belief, situation.reference, previous, **options
+        )
+    return _conclude(controller, decision, situation, last, on_failure, step)
+
+
+def _situation(
+    controller: Controller, belief: Gaussian, reference: Reference, last: Command | None
+) -> Situation:
+    """Returns what one step's decision is made on."""
+    return Situation.of(
+        controller,
+        belief,
+        reference,
+        last_state=None if last is None else last.state,
+        last_input=None if last is None else last.input,
+    )
 
 
 def decide_many(
@@ -134,15 +154,22 @@ def decide_many(
     controller with ``control_many`` is called once for all of them.
     """
     reference = reference.over(controller.horizon)
-    finite = [i for i, belief in enumerate(beliefs) if _is_finite(belief)]
+    situations = [
+        _situation(controller, belief, reference, command)
+        for belief, command in zip(beliefs, last, strict=True)
+    ]
+    finite = [i for i, one in enumerate(situations) if _is_finite(one.belief)]
     plans = [None if command is None else command.plan for command in last]
     control_many = getattr(controller, "control_many", None)
     if control_many is None or len(beliefs) == 1:
-        decided = [controller.control(beliefs[i], reference, plans[i]) for i in finite]
+        decided = [
+            controller.control(situations[i].belief, situations[i].reference, plans[i])
+            for i in finite
+        ]
     else:
         decided = control_many(
-            [beliefs[i] for i in finite],
-            [reference] * len(finite),
+            [situations[i].belief for i in finite],
+            [situations[i].reference for i in finite],
             [plans[i] for i in finite],
         )
     decisions = dict(zip(finite, decided, strict=True))
@@ -152,7 +179,7 @@ def decide_many(
             command: Command | SolverFailure = _conclude(
                 controller,
                 decisions.get(i),
-                reference,
+                situations[i],
                 last_command,
                 on_failure,
                 step,
@@ -284,18 +311,27 @@ class ControlLoop:
         check_number("share", share, least=0)
         plan = self.last.plan
         state = read_array("state", state, signals_of(self.controller).state_names)
-        if state.shape != plan.means.shape[1:]:
-            raise ShapeError(
-                f"state must have shape {plan.means.shape[1:]}; got {state.shape}"
-            )
+        n = self._measured_dim
+        if state.shape != (n,):
+            raise ShapeError(f"state must have shape {(n,)}; got {state.shape}")
         horizon = len(plan.inputs)
         stage = min(int(share), horizon - 1)
         input = plan.inputs[stage]
         if np.isfinite(plan.means).all() and np.isfinite(state).all():
-            planned_state = _state_along(plan.means, min(share, horizon))
+            planned_state = _state_along(plan.means[:, :n], min(share, horizon))
             error = self._short_way(state - planned_state)
-            input = input - self._gains_of(plan)[stage] @ error
+            input = input - self._gains_of(plan)[stage][:, :n] @ error
         return _within_bounds(self.controller, input, self._before_last)
+
+    @property
+    def _measured_dim(self) -> int:
+        """Number of the states that are measured of those of the plan."""
+        assert self.last is not None
+        assert self.last.plan is not None
+        decision = self.last.decision
+        if self.last.state is None or decision is None:
+            return self.last.plan.means.shape[1]
+        return decision.means.shape[1]
 
     def _gains_of(self, plan: Decision) -> np.ndarray:
         """Returns the gains (H, m, n) of a plan's feedback; zero without any."""
@@ -345,19 +381,26 @@ def _is_finite(belief: Gaussian) -> bool:
 def _conclude(
     controller: Controller,
     decision: Decision | None,
-    reference: Reference,
+    situation: Situation,
     last: Command | None,
     on_failure: OnFailure,
     step: int,
 ) -> Command:
     """Returns the command for a decision, None where the controller was not called."""
+    reference = situation.reference
     status = Status.INVALID_MEASUREMENT if decision is None else decision.status
     reason = status.advice
     if decision is not None and decision.applicable:
         fits = _has_right_shape(controller, decision, last)
         plan = _admit(controller, decision, last) if fits else None
         if plan is not None:
-            return Command(plan.input, status, decision=plan, plan=plan)
+            return Command(
+                input=plan.input,
+                status=status,
+                decision=situation.measured_part(plan),
+                plan=plan,
+                state=situation.state,
+            )
         reason = (
             f"its plan, {status.name}, is not finite or out of its bounds or shape; "
             f"its input: {decision.input}"
@@ -372,7 +415,13 @@ def _conclude(
     if plan is None:
         rule = "no earlier plan and no reference input to fall back on"
         raise SolverFailure(step, f"{reason} ({rule})")
-    return Command(plan.input, status, decision=decision, plan=plan)
+    return Command(
+        input=plan.input,
+        status=status,
+        decision=situation.measured_part(decision),
+        plan=plan,
+        state=situation.state,
+    )
 
 
 def _continue_last_plan(

@@ -9,6 +9,7 @@ import numpy as np
 from gpmpc._angles import state_difference
 from gpmpc._dynamics import linearize
 from gpmpc.models import DelayedModel
+from gpmpc.models._past import has_past
 from gpmpc.models._wrapper import Wrapper
 from gpmpc.mpc._controller import Reference, read_parameters
 from gpmpc.mpc._cost import FunctionNotFinite
@@ -127,6 +128,12 @@ class _RestSearch:
     ):
         self._prediction = prediction
         self._parameters = parameters
+        model = prediction.model
+        if has_past(model) and len(target) < model.state_dim:
+            input = prediction.initial_input
+            later = model.at_rest(target + step, input)
+            target = model.at_rest(target, input)
+            step = later - target
         self._target = target
         self._step = step
         self._target_input = target_input

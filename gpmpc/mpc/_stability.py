@@ -110,7 +110,8 @@ def stability(
     followed = read_reference(reference).in_order(prediction.signals)
     _check(prediction, plant, ahead)
     horizon = prediction.horizon
-    problem = prediction.problem
+    problem = prediction.stated_problem
+    n = problem.state_dim
     disturbance_gain = prediction.settings.disturbance_gain
     points = rest_points(prediction, followed, parameters)
     if not points:
@@ -123,7 +124,7 @@ def stability(
             gain_range=(math.nan, math.nan),
             disturbance_gain=disturbance_gain,
             safe_disturbance_gain=math.nan,
-            states=np.empty((0, problem.state_dim)),
+            states=np.empty((0, n)),
             inputs=np.empty((0, problem.input_dim)),
         )
     loops = [LinearLoop(prediction, point, plant, ahead) for point in points]
@@ -138,7 +139,7 @@ def stability(
         gain_range=(float(gain_ranges[:, 0].max()), float(gain_ranges[:, 1].min())),
         disturbance_gain=disturbance_gain,
         safe_disturbance_gain=_safe_disturbance_gain(loops, disturbance_gain),
-        states=np.array([point.state for point in points]),
+        states=np.array([point.state[:n] for point in points]),
         inputs=np.array([point.input for point in points]),
     )
 

@@ -42,9 +42,9 @@ class Starts:
         turns: int | Sequence[int],
     ):
         self._planner = planner
-        self._angles = list(planner.problem.cost.angle_indices)
+        self._angles = list(planner.prediction.problem.cost.angle_indices)
         H = planner.horizon
-        m = planner.problem.input_dim
+        m = planner.prediction.problem.input_dim
         shapes = [np.shape(guess) for guess in guesses if guess is not None]
         if any(shape != (H, m) for shape in shapes):
             raise ShapeError(f"guesses must be None or inputs ({H}, {m}); got {shapes}")

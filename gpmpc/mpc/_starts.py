@@ -286,6 +286,7 @@ class ManyStarts:
                     "must be of form 'trajectory', whose plans may start anywhere",
                 )
         self.problem = controller.problem
+        self._angles = controller.prediction.problem.cost.angle_indices
         self.horizon = controller.horizon
         self.initial_input = controller.initial_input
         self.signals = controller.signals
@@ -300,7 +301,8 @@ class ManyStarts:
         self._judges_flights = criterion is None
         self.criterion = self._cost if criterion is None else criterion
         means = StageLinearizer(controller.prediction.model, Linearization(), "none")
-        self._weights = StageCosts(self.problem, self.horizon, means).quadratic
+        problem = controller.prediction.problem
+        self._weights = StageCosts(problem, self.horizon, means).quadratic
         self._foresight = Foresight(controller)
         is_certain = controller.prediction.settings.covariance == "none"
         self._has_tubes = bool(self.problem.constraints) and not is_certain
@@ -320,9 +322,7 @@ class ManyStarts:
         if not np.isfinite(state).all():
             return self.controller.control(belief, reference, previous, parameters)
         if previous is not None and self._can_continue(previous):
-            turns = full_turns(
-                state - previous.means[1], self.problem.cost.angle_indices
-            )
+            turns = full_turns(state - previous.means[1], self._angles)
             belief = replace(belief, mean=belief.mean - torch.as_tensor(turns))
         situation = _Situation(belief, reference, previous, parameters)
         if self._judges_flights and _is_set_point(reference):
@@ -605,7 +605,7 @@ class ManyStarts:
 
     def _nearest_turn(self, reference: Reference, end: Array) -> Reference:
         """Returns the turn of a reference whose end is nearest to a state (n,)."""
-        turns = full_turns(end - reference.states[-1], self.problem.cost.angle_indices)
+        turns = full_turns(end - reference.states[-1], self._angles)
         return turned(reference, turns)
 
     def _plan_gains(

@@ -118,7 +118,8 @@ class GPMPC:
         model: What was learned.
         propagator: How the belief moves; ``covariance="none"`` needs the model's mean
             only.
-        problem: Weights and bounds.
+        problem: Weights and bounds; of a model whose state holds its past, of those
+            states that are measured, or of all.
         horizon: H, the number of predicted states.
         initial_input: The input before the first step, and the first guess of every
             planned one (m,).
@@ -185,7 +186,7 @@ class GPMPC:
         if budget is not None:
             check_number("budget", budget, above=0, unit="[s]")
         self.initial_input = self.prediction.initial_input
-        self.problem = self.prediction.problem
+        self.problem = self.prediction.stated_problem
         self.horizon = horizon
         self.iterations = iterations
         self.tolerance = tolerance

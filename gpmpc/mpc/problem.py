@@ -37,6 +37,7 @@ from gpmpc.mpc._cost import (
     Tracking,
     by_stage,
     expand_function,
+    of_first_states,
     read_numbers,
 )
 from gpmpc.qp._problem import ABSENT
@@ -108,6 +109,10 @@ class Constraint:
 
     def rows(self, horizon: int) -> ConstraintSides:
         """Returns the rows of all stages."""
+        raise NotImplementedError
+
+    def over(self, n: int, states: int) -> "Constraint":
+        """Returns the constraint of the first n of more states."""
         raise NotImplementedError
 
     def standard_deviations(self, sides: int = 1) -> float:
@@ -200,6 +205,15 @@ class Box(Constraint):
         upper = by_stage("upper", self.upper, horizon, 1)
         return lower, upper
 
+    def over(self, n: int, states: int) -> "Box":
+        """Returns the bounds of the first n of more states."""
+        further = [(0, 0)] * (self.lower.ndim - 1) + [(0, states - n)]
+        return replace(
+            self,
+            lower=np.pad(self.lower, further, constant_values=-math.inf),
+            upper=np.pad(self.upper, further, constant_values=math.inf),
+        )
+
     def rows(self, horizon: int) -> ConstraintSides:
         """Returns one row for each entry with a bound, upper ones first."""
         lower, upper = self.by_stage(horizon)
@@ -252,6 +266,10 @@ class Halfspaces(Constraint):
         """Number of states, n."""
         return self.F.shape[1]
 
+    def over(self, n: int, states: int) -> "Halfspaces":
+        """Returns the constraints of the first n of more states."""
+        return replace(self, F=np.pad(self.F, ((0, 0), (0, states - n))))
+
     def rows(self, horizon: int) -> ConstraintSides:
         """Returns F, no lower bounds, and f of every stage."""
         upper = by_stage("f", self.f, horizon, 1)
@@ -291,6 +309,10 @@ class Inequality(Constraint):
         check_number("count", self.count, least=1, whole=True)
         if not callable(self.h):
             raise SettingError("h", f"must be a function; got {type(self.h).__name__}")
+
+    def over(self, n: int, states: int) -> "Inequality":
+        """Returns the constraints of the first n of more states."""
+        return replace(self, h=of_first_states(self.h, n, states))
 
     def rows(self, horizon: int) -> ConstraintSides:
         """Returns the places of its rows: gradients without columns, bounds of 0."""
@@ -354,6 +376,32 @@ class Problem:
         if self.cost.angles is not None:
             return self
         return replace(self, cost=replace(self.cost, angles=tuple(angles)))
+
+    def over(self, states: int) -> "Problem":
+        """Returns the problem of more states, of which these are the first.
+
+        Further ones cost nothing and are not bounded; functions do not see them.
+        """
+        n = self.state_dim
+        if states == n:
+            return self
+        further = states - n
+        cost = self.cost
+        weight = ((0, further), (0, further))
+        by_stage = ((0, 0),) * (cost.Q.ndim - 2)
+        return replace(
+            self,
+            cost=replace(
+                cost,
+                Q=np.pad(cost.Q, (*by_stage, *weight)),
+                terminal=np.pad(cost.terminal, weight),
+            ),
+            constraints=[part.over(n, states) for part in self.constraints],
+            outputs=[
+                replace(output, y=of_first_states(output.y, n, states))
+                for output in self.outputs
+            ],
+        )
 
     def _read_box(self, key: str) -> Box:
         """Returns bounds of inputs or increments, infinite where there are none."""

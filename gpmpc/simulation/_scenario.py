@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.models._past import measured_dim
 from gpmpc.mpc import Controller, FlightJudge, Reference
 from gpmpc.mpc._controller import check_method, read_reference
 from gpmpc.mpc._policy import OnFailure, check_policy
@@ -110,7 +111,7 @@ class Scenario:
         system = self.system
         if isinstance(system, ModelLoop):
             model = system.model
-            return FlightJudge.of(self.controller, model.state_dim, model.input_dim)
+            return FlightJudge.of(self.controller, measured_dim(model), model.input_dim)
         return FlightJudge.of(
             self.controller,
             state_dim=len(system.state_names),

@@ -25,6 +25,7 @@ from gpmpc.exceptions import (
     check_numbers,
 )
 from gpmpc.gaussian import Gaussian
+from gpmpc.models._past import belief_of_all, has_past, measured_dim
 from gpmpc.propagation import Propagator
 from gpmpc.signals import Signals, signals_of
 from gpmpc.simulation._disturbances import Disturbance
@@ -276,7 +277,10 @@ class ModelSimulator:
         self.loop = loop
         self._steps = 0
         model = loop.model
+        mean = initial.mean if isinstance(initial, Gaussian) else initial
         n = model.state_dim
+        if np.size(mean) == measured_dim(model):
+            n = measured_dim(model)
         options: Any = {"device": model.device, "dtype": model.dtype}
         mean = initial
         covariance = _INITIAL_DEVIATION**2 * torch.eye(n, **options)
@@ -286,17 +290,20 @@ class ModelSimulator:
             mean = belief.mean
             covariance = belief.covariance
         mean = torch.as_tensor(_check_state(mean, n, names), **options)
+        #: over all of the state, from the first step on
         self._belief = Gaussian(mean, covariance.to(**options))
+        self._measured_dim = n
 
     @property
     def mean(self) -> Array:
-        """Mean of the belief (n,)."""
-        return to_array(self._belief.mean)
+        """Mean of the belief over what is measured (n,)."""
+        return to_array(self._belief.mean)[: self._measured_dim]
 
     @property
     def covariance(self) -> Array:
-        """Covariance of the belief (n, n)."""
-        return to_array(self._belief.covariance)
+        """Covariance of the belief over what is measured (n, n)."""
+        n = self._measured_dim
+        return to_array(self._belief.covariance)[:n, :n].copy()
 
     @property
     def state(self) -> SystemState:
@@ -309,8 +316,12 @@ class ModelSimulator:
         return angles_of(self.loop.model)
 
     def measure(self, time: float) -> Gaussian:
-        """Returns the belief."""
-        return self._belief
+        """Returns the belief over what is measured."""
+        n = self._measured_dim
+        belief = self._belief
+        if len(belief.mean) == n:
+            return belief
+        return Gaussian(belief.mean[:n], belief.covariance[:n, :n])
 
     def step(self, input: Array) -> Array | Diverged:
         """Carries the belief one step on.
@@ -318,7 +329,12 @@ class ModelSimulator:
         Returns the input (m,), or why the belief cannot go on.
         """
         control = torch.as_tensor(np.asarray(input, dtype=float)).to(self._belief.mean)
-        belief = self.loop.propagator(self.loop.model, self._belief, control)
+        belief = self._belief
+        model = self.loop.model
+        if has_past(model) and len(belief.mean) < model.state_dim:
+            state = model.at_rest(to_array(belief.mean), to_array(control))
+            belief = belief_of_all(belief, state)
+        belief = self.loop.propagator(model, belief, control)
         mean_is_finite = torch.isfinite(belief.mean).all()
         covariance_is_finite = torch.isfinite(belief.covariance).all()
         if not (mean_is_finite and covariance_is_finite):

@@ -159,7 +159,8 @@ class Experiment:
             return nothing
         model = self.model if training is None else training.posterior
         if model is not None and self.learns:
-            return model.noise_covariance.diagonal().sqrt().numpy()
+            variances = model.noise_covariance.diagonal()[: len(nothing)]
+            return variances.sqrt().numpy()
         if self.noise is None or self.noise.process is None:
             return nothing
         return np.array(self.noise.process, dtype=float)

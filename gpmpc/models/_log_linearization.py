@@ -1,0 +1,289 @@
+"""Linearises models of logs, with all that they carry on beside a state.
+
+What is carried on moves on linearly: inputs through lags and delays, past rows through
+the memory. So does the linear term, and GPs have their own derivatives. Features,
+nominal part and kinematics are functions of a state and of the inputs as they act:
+only they are differentiated by central differences, all points in one batch.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from gpmpc._dynamics import Array, Linearized
+from gpmpc.models._log_model import LogModel, OutputGP
+
+DIFFERENCE = 1e-5  # of central differences, relative to entries above one
+
+
+class LogLinearizer:
+    """Linearises one model of a log at many points.
+
+    Args:
+        model: Without context.
+        input_dim: m.
+        time_step: [s].
+    """
+
+    def __init__(self, model: LogModel, input_dim: int, time_step: float):
+        self._model = model
+        self._m = input_dim
+        self._time_step = time_step
+        self._n = model.kinematics.space.dim
+        self._o = len(model.history)
+        self._maps = _linear_maps(model, input_dim, time_step)
+
+    def __call__(self, states: Array, inputs: Array, covariance: bool) -> Linearized:
+        """Linearises at K points.
+
+        Args:
+            states: With all that is carried on (K, n + ...).
+            inputs: (K, m).
+            covariance: Whether the covariances at the points are computed.
+        """
+        n = self._n
+        maps = self._maps
+        parts = self._model.parts(states, self._m)
+        carried = states[:, n:]
+        acting = carried @ maps.acting_by_carried.T + inputs @ maps.acting_by_input.T
+        x = parts.states
+        local = self._differentiate(x, acting)
+        outputs = self._outputs(local, parts.memory, covariance)
+        after = self._model.kinematics.step(x, outputs.mean, self._time_step)
+        state_by_state, state_by_outputs = self._differentiate_step(x, outputs.mean)
+        by_features = maps.carried_by_features
+        by_learned = maps.carried_by_learned
+        # By state and acting inputs (., n + m), and by what is remembered (., s):
+        state_by_point = state_by_outputs @ outputs.by_point
+        state_by_point[..., :n] += state_by_state
+        carried_by_point = by_features @ local.features_by_point
+        carried_by_point = carried_by_point + by_learned @ outputs.learned_by_point
+        next_by_point = np.concatenate([state_by_point, carried_by_point], axis=1)
+        each_by_learned = np.broadcast_to(by_learned, (len(x), *by_learned.shape))
+        next_by_outputs = np.concatenate([state_by_outputs, each_by_learned], axis=1)
+        next_by_acting = next_by_point[..., n:]
+        A = np.empty((len(x), states.shape[1], states.shape[1]))
+        A[..., :n] = next_by_point[..., :n]
+        A[..., n:] = next_by_acting @ maps.acting_by_carried
+        A[:, n:, n:] += maps.carried_by_carried
+        s = parts.memory.shape[1]
+        if s:
+            A[..., -s:] += next_by_outputs @ outputs.by_memory
+        B = next_by_acting @ maps.acting_by_input
+        B[:, n:] += maps.carried_by_input
+        carried_after = (
+            carried @ maps.carried_by_carried.T
+            + inputs @ maps.carried_by_input.T
+            + local.features @ by_features.T
+            + outputs.learned @ by_learned.T
+        )
+        V = None
+        if covariance:
+            V = next_by_outputs @ outputs.covariance @ next_by_outputs.mT
+        mean = np.concatenate([after, carried_after], axis=1)
+        return Linearized(mean, A, np.ascontiguousarray(B), V)
+
+    def _differentiate(self, x: Array, acting: Array) -> "_Point":
+        """Evaluates features and nominal outputs, with their derivatives."""
+        n = self._n
+        no_context = np.empty((len(x), 0))
+        model = self._model
+        d = len(model.features(x[0], acting[0], no_context[0]))
+
+        def values(point: Array) -> Array:
+            x, acting = point[..., :n], point[..., n:]
+            features = model.features(x, acting, no_context)
+            nominal = model.nominal_outputs(x, acting, no_context)
+            return np.concatenate([features, nominal], axis=-1)
+
+        point = np.concatenate([x, acting], axis=-1)
+        value, slopes = _central_differences(values, point)
+        return _Point(
+            features=value[:, :d],
+            nominal=value[:, d:],
+            features_by_point=slopes[:, :d],
+            nominal_by_point=slopes[:, d:],
+        )
+
+    def _differentiate_step(self, x: Array, outputs: Array) -> tuple[Array, Array]:
+        """Returns the derivatives of next states by states and by outputs."""
+        n = self._n
+
+        def values(point: Array) -> Array:
+            state, outputs = point[..., :n], point[..., n:]
+            return self._model.kinematics.step(state, outputs, self._time_step)
+
+        angles = list(self._model.kinematics.space.angles)
+        point = np.concatenate([x, outputs], axis=-1)
+        _, slopes = _central_differences(values, point, angles)
+        return slopes[..., :n], slopes[..., n:]
+
+    def _outputs(
+        self, local: "_Point", memory: Array, covariance: bool
+    ) -> "_LocalOutputs":
+        """Returns the outputs at points, with their derivatives."""
+        model = self._model
+        K = len(memory)
+        d = local.features.shape[1]
+        s = memory.shape[1]
+        o = self._o
+        regressors = local.features
+        if model.weights.size or s:
+            regressors = model.memory.regressors(local.features, memory)
+        learned = np.zeros((K, o))
+        by_features = np.zeros((K, o, d))
+        by_memory = np.zeros((K, o, s))
+        V = np.zeros((K, o, o))
+        if model.weights.size:
+            learned += regressors @ model.weights.T
+            by_regressors = model.weights
+            by_features += by_regressors @ self._maps.regressors_by_features
+            by_memory += by_regressors @ self._maps.regressors_by_memory
+        for gp in model.gps:
+            prediction = _gp_prediction(gp, local.features, regressors, covariance)
+            rows = list(gp.outputs)
+            learned[:, rows] += prediction.mean
+            if gp.sees_memory:
+                to_regressors = self._maps.regressors_by_features[:-1]
+                by_features[:, rows] += prediction.A @ to_regressors
+                to_memory = self._maps.regressors_by_memory[:-1]
+                by_memory[:, rows] += prediction.A @ to_memory
+            else:
+                by_features[:, rows] += prediction.A
+            if prediction.covariance is not None:
+                V[np.ix_(range(K), rows, rows)] += prediction.covariance
+        learned_by_point = by_features @ local.features_by_point
+        return _LocalOutputs(
+            mean=local.nominal + learned,
+            learned=learned,
+            by_point=local.nominal_by_point + learned_by_point,
+            learned_by_point=learned_by_point,
+            by_memory=by_memory,
+            covariance=V,
+        )
+
+
+class _Point(NamedTuple):
+    """Functions of a state and of the inputs as they act, at K points."""
+
+    features: Array  # z (K, d)
+    nominal: Array  # outputs of the nominal part (K, o)
+    features_by_point: Array  # by x and the acting inputs (K, d, n + m)
+    nominal_by_point: Array  # (K, o, n + m)
+
+
+class _LocalOutputs(NamedTuple):
+    """Outputs at K points, with their derivatives."""
+
+    mean: Array  # (K, o)
+    learned: Array  # what linear term and GPs add (K, o)
+    by_point: Array  # of the outputs, by x and the acting inputs (K, o, n + m)
+    learned_by_point: Array  # of what they add (K, o, n + m)
+    by_memory: Array  # of both, by s (K, o, s)
+    covariance: Array  # of the GPs (K, o, o)
+
+
+class _LinearMaps(NamedTuple):
+    """How what is carried on, c = (lagged, pending, s), acts and moves on."""
+
+    acting_by_carried: Array  # (m, c)
+    acting_by_input: Array  # (m, m)
+    carried_by_carried: Array  # (c, c)
+    carried_by_input: Array  # (c, m)
+    carried_by_features: Array  # (c, d)
+    carried_by_learned: Array  # (c, o)
+    regressors_by_features: Array  # (r, d)
+    regressors_by_memory: Array  # (r, s)
+
+
+def _linear_maps(model: LogModel, m: int, time_step: float) -> _LinearMaps:
+    """Returns the linear maps of a model of m inputs."""
+    o = len(model.history)
+    d = len(model.features(model.kinematics.space.origin, np.zeros(m), np.empty(0)))
+    lagged = len(model.time_constants)
+    pending = model.lag * m
+    c = model.carried_dim(m)
+    s = c - lagged - pending
+    # Of the queue (pending, input), by (c, input):
+    queue = np.eye(pending + m, lagged + pending + s + m, k=lagged)
+    queue[pending:] = np.eye(m, c + m, k=c)
+    command = queue[:m]
+    acting = command
+    after = np.zeros((c, c + m))
+    if lagged:
+        lags = model.lags(time_step)
+        state = np.eye(lagged, c + m)
+        acting = lags.acting(state.T, command.T).T
+        after[:lagged] = lags.after(state.T, command.T).T
+    after[lagged : lagged + pending] = queue[m:]
+    by_features = np.zeros((c, d))
+    by_learned = np.zeros((c, o))
+    regressors_by_features = np.eye(d)
+    regressors_by_memory = np.zeros((d, s))
+    if s or model.weights.size:
+        memory = model.memory
+        first = lagged + pending
+        # The memory is linear, so that its values at unit vectors are its matrices.
+        after[first:, first:c] = _matrix(
+            lambda e: memory.step(e, np.zeros((s, d)), np.zeros((s, o))), s
+        )
+        by_features[first:] = _matrix(
+            lambda e: memory.step(np.zeros((d, s)), e, np.zeros((d, o))), d
+        )
+        by_learned[first:] = _matrix(
+            lambda e: memory.step(np.zeros((o, s)), np.zeros((o, d)), e), o
+        )
+        one = memory.regressors(np.zeros(d), np.zeros(s))
+        regressors_by_features = _matrix(
+            lambda e: memory.regressors(e, np.zeros((d, s))) - one, d
+        )
+        regressors_by_memory = _matrix(
+            lambda e: memory.regressors(np.zeros((s, d)), e) - one, s
+        )
+    return _LinearMaps(
+        acting_by_carried=acting[:, :c],
+        acting_by_input=acting[:, c:],
+        carried_by_carried=after[:, :c],
+        carried_by_input=after[:, c:],
+        carried_by_features=by_features,
+        carried_by_learned=by_learned,
+        regressors_by_features=regressors_by_features,
+        regressors_by_memory=regressors_by_memory,
+    )
+
+
+def _matrix(function: Callable[[Array], Array], size: int) -> Array:
+    """Returns the matrix of a linear function of rows of a size."""
+    return np.ascontiguousarray(function(np.eye(size)).T)
+
+
+def _central_differences(
+    function: Callable[[Array], Array], points: Array, angles: list[int] | None = None
+) -> tuple[Array, Array]:
+    """Returns the values (K, v) and the slopes (K, v, p) of a function.
+
+    Args:
+        function: Of points (..., K, p).
+        points: (K, p).
+        angles: Indices of the values that are wrapped.
+    """
+    p = points.shape[1]
+    h = DIFFERENCE * np.maximum(np.abs(points), 1.0)  # (K, p)
+    directions = np.concatenate([np.zeros((1, p)), np.eye(p), -np.eye(p)])
+    values = function(points + directions[:, None] * h)  # (1 + 2 p, K, v)
+    differences = values[1 : 1 + p] - values[1 + p :]
+    if angles:
+        wrapped = differences[..., angles]
+        differences[..., angles] = wrapped - 2 * np.pi * np.round(wrapped / (2 * np.pi))
+    slopes = differences / (2 * h.T[..., None])
+    return values[0], np.moveaxis(slopes, 0, -1)
+
+
+def _gp_prediction(
+    gp: OutputGP, features: Array, regressors: Array, covariance: bool
+) -> Linearized:
+    """Linearises a GP by what it sees."""
+    seen = regressors[:, :-1] if gp.sees_memory else features
+    no_inputs = np.empty((len(seen), 0))
+    return gp.posterior.linearize(np.ascontiguousarray(seen), no_inputs, covariance)

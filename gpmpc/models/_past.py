@@ -1,0 +1,60 @@
+"""Models whose state holds the past beside what is measured.
+
+A loop measures the first states of such a model alone. What follows them is known from
+the rows before: inputs on their way, what lags hold, what is remembered. It is kept
+from step to step by ``at_rest``, where a flight begins, and ``follow``.
+"""
+
+from typing import Any, Protocol, TypeGuard
+
+import torch
+
+from gpmpc._dynamics import Array, DynamicsModel
+from gpmpc.gaussian import Gaussian
+
+
+class ModelWithPast(DynamicsModel, Protocol):
+    """A model whose state begins with what is measured, and goes on with the past."""
+
+    @property
+    def measured_dim(self) -> int:
+        """Number of the states that are measured, the first ones."""
+        ...
+
+    def at_rest(self, measured: Array, input: Array) -> Array:
+        """Returns the state (n,) of a plant that stood where it is first measured.
+
+        Args:
+            measured: (measured_dim,).
+            input: That was applied all the time (m,).
+        """
+        ...
+
+    def follow(self, state: Array, input: Array, measured: Array) -> Array:
+        """Returns the state (n,) that a measurement says.
+
+        Args:
+            state: That of the step before (n,).
+            input: That was applied there (m,).
+            measured: What it led to (measured_dim,).
+        """
+        ...
+
+
+def measured_dim(model: Any) -> int:
+    """Returns the number of a model's states that are measured; all of most models."""
+    return getattr(model, "measured_dim", model.state_dim)
+
+
+def has_past(model: Any) -> TypeGuard[ModelWithPast]:
+    """Returns whether a model's state holds more than what is measured."""
+    measured = getattr(model, "measured_dim", None)
+    return measured is not None and measured < model.state_dim
+
+
+def belief_of_all(belief: Gaussian, state: Array) -> Gaussian:
+    """Returns a belief over the whole state (n,); what is not measured is certain."""
+    covariance = torch.zeros(len(state), len(state), dtype=torch.float64)
+    n = belief.mean.shape[-1]
+    covariance[:n, :n] = belief.covariance
+    return Gaussian(torch.from_numpy(state), covariance)

@@ -1,0 +1,114 @@
+"""Keeps the past of models that have it in their state, from step to step of a loop.
+
+A loop measures the first states of such a model. The others follow from what was
+measured and applied before: a ``Command`` holds the state that its step began in, and
+the next one begins in the state that the new measurement says. Where there is none, it
+is the one that the model predicts.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gpmpc._dynamics import Array, linearize, to_array
+from gpmpc.gaussian import Gaussian
+from gpmpc.models._past import ModelWithPast, belief_of_all, has_past
+from gpmpc.mpc._controller import Decision, Reference, model_of
+from gpmpc.signals import signals_of
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What one step's decision is made on, with the past of the controller's model."""
+
+    belief: Gaussian  #: over the model's whole state
+    reference: Reference  #: of it
+    #: mean of the belief, or what was predicted where nothing was measured (n,); None
+    #: of models without a past, and before the first measurement
+    state: Array | None = None
+    measured_dim: int | None = None  #: None where all of the state is measured
+
+    @classmethod
+    def of(
+        cls,
+        controller: Any,
+        belief: Gaussian,
+        reference: Reference,
+        last_state: Array | None,
+        last_input: Array | None,
+    ) -> "Situation":
+        """Completes what was measured.
+
+        Args:
+            controller: Whose model counts.
+            belief: Over what is measured, or over all of the model's state.
+            reference: Likewise.
+            last_state: That the step before began in; None at the first.
+            last_input: That was applied there.
+        """
+        model = model_of(controller)
+        if not has_past(model):
+            return cls(belief, reference)
+        n = model.measured_dim
+        problem = getattr(controller, "problem", None)
+        # A loop of all states is told all of them.
+        weighed = n if problem is None else problem.state_dim
+        if belief.mean.shape[-1] != n or weighed != n:
+            return cls(belief, reference)
+        belief = belief.in_order(signals_of(controller).state_names)
+        measured = to_array(belief.mean)
+        if last_input is None:
+            last_input = np.asarray(controller.initial_input, dtype=float)
+        state = _state(model, measured, last_state, last_input)
+        if state is None:
+            unknown = np.full(model.state_dim, np.nan)
+            reference = _reference_of_all(reference, np.zeros_like(unknown), n)
+            return cls(Gaussian.certain(unknown), reference, measured_dim=n)
+        is_measured = np.isfinite(measured).all()
+        return cls(
+            belief=belief_of_all(belief, state if is_measured else np.nan * state),
+            reference=_reference_of_all(reference, state, n),
+            state=state,
+            measured_dim=n,
+        )
+
+    def measured_part(self, decision: Decision | None) -> Decision | None:
+        """Returns a decision whose plan is of the states that are measured."""
+        n = self.measured_dim
+        if decision is None or n is None:
+            return decision
+        return replace(
+            decision,
+            means=np.ascontiguousarray(decision.means[:, :n]),
+            covariances=np.ascontiguousarray(decision.covariances[:, :n, :n]),
+        )
+
+
+def _state(
+    model: ModelWithPast,
+    measured: Array,
+    last_state: Array | None,
+    last_input: Array,
+) -> Array | None:
+    """Returns the state (n,) of now; None where nothing is known of it."""
+    is_measured = np.isfinite(measured).all()
+    if last_state is None:
+        return model.at_rest(measured, last_input) if is_measured else None
+    if not is_measured:
+        local = linearize(model, last_state[None], last_input[None], covariance=False)
+        return local.mean[0]
+    return model.follow(last_state, last_input, measured)
+
+
+def _reference_of_all(reference: Reference, state: Array, n: int) -> Reference:
+    """Returns a reference of the whole state; nothing weighs what was added to it."""
+    states = np.asarray(reference.states, dtype=float)
+    if states.shape[-1] != n:
+        return reference
+    further = np.broadcast_to(state[n:], (len(states), len(state) - n))
+    return Reference(
+        states=np.hstack([states, further]),
+        inputs=reference.inputs,
+        kappas=reference.kappas,
+    )
