@@ -1,6 +1,6 @@
 """What ``gpmpc learn`` makes of logs, beside what costs nothing.
 
-    .venv/bin/python -m benchmarks.log_models [--plants pendulum ...] [--seeds 1]
+    .venv/bin/python -m benchmarks.log_models [--plants pendulum ...] [--fly]
     .venv/bin/python -m benchmarks.log_models --flights FOLDER [--splits 6]
 
 Six simulated plants (``log_plants``): 60 s of excited runs with noise on every state,
@@ -8,8 +8,9 @@ at 100 Hz; the model is learned from the first 48 s and judged on the last 12 s.
 ``--flights``, the airborne flights of NanoBench in a folder (Ullah and Baca, 2026,
 arXiv:2603.09908; not part of this package), two held out of each split. A line for each
 group of states and step ahead: the model's mean error, over that of the best baseline,
-coverage and width of its 95 % intervals. Lines are also appended to
-``outputs/benchmarks/log_models.jsonl``.
+coverage and width of its 95 % intervals. With ``--fly`` each model is flown to its
+plant's task (``log_flights``); ``--plants "lagging pendulum"`` is one more plant. Lines
+are also appended to ``outputs/benchmarks/log_models.jsonl``.
 """
 
 import argparse
@@ -22,7 +23,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.log_plants import plants
+from benchmarks.log_flights import TASKS, compare
+from benchmarks.log_plants import Plant, lagging_pendulum, plants
 from benchmarks.timing import RESULTS
 from gpmpc.logs import (
     IdentifiedModel,
@@ -68,13 +70,16 @@ class Case(NamedTuple):
     name: str
     train: Log
     held_out: Log
+    plant: Plant | None = None
+    seed: int = 0
 
 
 def plant_cases(names: list[str], seeds: int) -> Iterator[Case]:
     """Simulates the logs of plants."""
-    for plant in plants():
-        if names and plant.name not in names:
-            continue
+    chosen = plants()
+    if names:
+        chosen = [one for one in (*chosen, lagging_pendulum()) if one.name in names]
+    for plant in chosen:
         for seed in range(seeds):
             table = plant.log(seed)
             mapping = LogMapping.from_dict(dict(plant.mapping))
@@ -88,7 +93,7 @@ def plant_cases(names: list[str], seeds: int) -> Iterator[Case]:
                 context=np.empty((len(table), 0)),
             )
             train, held_out = Log(mapping, 0.01, (run,)).split_by_time(0.8)
-            yield Case(f"{plant.name}, seed {seed}", train, held_out)
+            yield Case(f"{plant.name}, seed {seed}", train, held_out, plant, seed)
 
 
 def flight_cases(folder: Path, splits: int) -> Iterator[Case]:
@@ -144,10 +149,15 @@ def report(case: Case, learned: IdentifiedModel, judgement: Judgement) -> None:
             f"{row['ratio']:.3f} of {row['baseline']}, "
             f"coverage {row['coverage']:.3f}, width {row['width']:.2f}{faults}"
         )
+    keep([row | {"chosen": chosen} for row in rows])
+
+
+def keep(rows: list[dict[str, Any]]) -> None:
+    """Appends lines to the results."""
     RESULTS.mkdir(parents=True, exist_ok=True)
     with (RESULTS / "log_models.jsonl").open("a", encoding="utf-8") as file:
         for row in rows:
-            file.write(json.dumps(row | {"chosen": chosen}) + "\n")
+            file.write(json.dumps(row) + "\n")
 
 
 def main() -> None:
@@ -157,6 +167,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--flights", type=Path)
     parser.add_argument("--splits", type=int, default=6)
+    parser.add_argument("--fly", action="store_true")
     parser.add_argument("--progress", action="store_true")
     arguments = parser.parse_args()
     if arguments.flights is None:
@@ -170,6 +181,8 @@ def main() -> None:
         judgement = judge(learned, case.held_out, case.train)
         report(case, learned, judgement)
         print(f"  {time.process_time() - began:.0f} s of one core", flush=True)
+        if arguments.fly and case.plant is not None and case.plant.name in TASKS:
+            keep([compare(case.plant, learned, case.seed)])
 
 
 if __name__ == "__main__":

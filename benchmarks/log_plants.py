@@ -45,6 +45,25 @@ ARM = """
   </actuator>
 </mujoco>
 """
+LAGGING_PENDULUM = """
+<mujoco>
+  <option timestep="0.002" integrator="RK4" gravity="0 0 -9.81"/>
+  <worldbody>
+    <body>
+      <joint name="hinge" type="hinge" axis="0 1 0" damping="0.05"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.03" mass="1.0"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <general name="torque" joint="hinge" dyntype="filter" dynprm="0.08"
+      ctrlrange="-4 4" ctrllimited="true"/>
+  </actuator>
+  <sensor>
+    <jointpos name="angle" joint="hinge"/>
+    <jointvel name="rate" joint="hinge"/>
+  </sensor>
+</mujoco>
+"""
 BODY = ["px", "py", "pz", "qx", "qy", "qz", "qw", "vx", "vy", "vz", "wx", "wy", "wz"]
 ROTORS = ["u1", "u2", "u3", "u4"]
 
@@ -205,17 +224,26 @@ def _quadrotor_excitation(rng: np.random.Generator) -> Law:
     return law
 
 
-def _arm() -> System:
-    """Makes the arm; its file only has to live until it is loaded."""
+def _mujoco(xml: str, **settings: Any) -> System:
+    """Makes a MuJoCo model; its file only has to live until it is loaded."""
     with TemporaryDirectory() as folder:
-        path = Path(folder) / "arm.xml"
-        path.write_text(ARM)
-        return mujoco_system(
-            path,
-            joints=["shoulder", "elbow"],
-            actuators=["tau1", "tau2"],
-            substeps=5,
-        )
+        path = Path(folder) / "model.xml"
+        path.write_text(xml)
+        return mujoco_system(path, substeps=5, **settings)
+
+
+def _arm() -> System:
+    return _mujoco(ARM, joints=["shoulder", "elbow"], actuators=["tau1", "tau2"])
+
+
+def _lagging_pendulum() -> System:
+    return _mujoco(
+        LAGGING_PENDULUM,
+        sensors=["angle", "rate"],
+        actuators=["torque"],
+        angles=["angle"],
+        observation={"input_delay": 4},
+    )
 
 
 def _quadrotor() -> System:
@@ -231,6 +259,22 @@ def _quadrotor() -> System:
         tracked=["px", "py", "pz"],
         goal=[0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0],
         initial_input=[0.5 * GRAVITY / 4] * 4,
+    )
+
+
+def lagging_pendulum() -> Plant:
+    """Returns a pendulum whose motor lags and acts late; neither is measured."""
+    return Plant(
+        name="lagging pendulum",
+        system=_lagging_pendulum,
+        mapping={
+            "time": "t",
+            "states": _vectors({"angle": "rad", "rate": "rad/s"}, ("angle",)),
+            "inputs": {"torque": {"columns": ["torque"], "unit": "N m"}},
+        },
+        noise=(0.005, 0.03),
+        excite=lambda rng: held(rng, [-4.0], [4.0], 0.1, 0.8),
+        start=(0.0, 0.0),
     )
 
 

@@ -1,11 +1,11 @@
 """Judges whether a controller can plan with a model that was learned from a log.
 
 A controller asks what its inputs do, and predicts little by what usually happens. So
-the effects of the inputs on the outputs are found once more, by a regression on the
-rows themselves with intervals, and the derivatives of the model stand beside them. Of
-an input that only follows the states, or does not move, the rows cannot tell the
-effect; flights that can are named. And a feedback that is designed on the model has to
-stabilise the other candidates as well, about some states of the log.
+the effects of the inputs, as they act, on the outputs are found once more, by a
+regression on the rows themselves with intervals, and the derivatives of the model stand
+beside them. Of an input that only follows the states, or does not move, the rows cannot
+tell the effect; flights that can are named. And a feedback that is designed on the
+model has to stabilise the other candidates as well, about some states of the log.
 """
 
 from collections.abc import Mapping, Sequence
@@ -63,11 +63,15 @@ def judge_for_control(
         rivals: Other models of the log, by their names.
     """
     stride = max(len(log) // _ROWS, 1)
-    windows = log.windows(1, stride=stride)
-    states = windows.states[:, 0]
-    inputs = windows.inputs[:, 0]
-    context = windows.context[:, 0]
-    measured = model.kinematics.outputs(states, windows.states[:, 1], log.time_step)
+    acts_late = bool(model.lag or len(model.time_constants))
+    start = model.past if acts_late else 0
+    windows = log.windows(1, past=start, stride=stride)
+    states = windows.states[:, start]
+    next_states = windows.states[:, start + 1]
+    acting, _ = model.acting_inputs(windows, slice(start, start + 1))
+    inputs = acting[:, 0]
+    context = windows.context[:, start]
+    measured = model.kinematics.outputs(states, next_states, log.time_step)
     gains, errors = _gains(model, states, inputs, context, measured)
     slopes = _mean_slopes(model, states, inputs, context)
     deviation = np.maximum(measured.std(axis=0), 1e-12)

@@ -72,8 +72,8 @@ def learn(
         progress: Called with a line at each stage.
         memory: Holds results of the stages, as plain data: those of an earlier call
             with equal arguments are not computed again.
-        for_control: Leaves out what predicts such runs and no controller can plan with:
-            the feedback of the controller that flew, inputs that act late, and the
+        for_control: Leaves out what predicts such runs and misleads a controller: the
+            feedback of the controller that flew, a memory of past rows, and the
             correction by the past. Judges what the inputs do.
 
     Raises:

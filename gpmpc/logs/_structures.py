@@ -216,7 +216,6 @@ def additions(structure: Structure) -> tuple[Addition, ...]:
         key="first_order_lags",
         words="first-order lags",
         extend=_with_lags(structure.inputs),
-        for_control=False,
     )
     if isinstance(structure.model.nominal, MultirotorNominal):
         alone = _alone_additions(structure.model)
@@ -348,6 +347,6 @@ _MULTIROTOR_ADDITIONS = (
     Addition("force_disturbance", "force disturbance", _with_force_disturbance),
     Addition("motor_torque", "motor torque", _with_motor_torque),
     Addition("feedback", "feedback", _with_feedback, for_control=False),
-    Addition("lag", f"inputs {LATE} rows late", _with_late_inputs, for_control=False),
+    Addition("lag", f"inputs {LATE} rows late", _with_late_inputs),
     Addition("torque_disturbance", "torque disturbance", _with_torque_disturbance),
 )

@@ -87,12 +87,12 @@ class LogLinearizer:
     def _differentiate(self, x: Array, acting: Array) -> "_Point":
         """Evaluates features and nominal outputs, with their derivatives."""
         n = self._n
-        no_context = np.empty((len(x), 0))
         model = self._model
-        d = len(model.features(x[0], acting[0], no_context[0]))
+        d = self._maps.carried_by_features.shape[1]
 
         def values(point: Array) -> Array:
             x, acting = point[..., :n], point[..., n:]
+            no_context = np.empty((*point.shape[:-1], 0))
             features = model.features(x, acting, no_context)
             nominal = model.nominal_outputs(x, acting, no_context)
             return np.concatenate([features, nominal], axis=-1)

@@ -86,7 +86,8 @@ class Scenario:
                 raise SettingError(
                     "disturbances, noise", "need a plant in the loop; got a ModelLoop"
                 )
-            return ModelSimulator(self.system, self.initial)
+            resting_input = getattr(self.controller, "initial_input", None)
+            return ModelSimulator(self.system, self.initial, resting_input)
         return PlantSimulator(
             plant=self.system,
             initial=self.initial,

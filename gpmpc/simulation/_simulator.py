@@ -271,15 +271,19 @@ class ModelSimulator:
     Args:
         loop: The model and how its belief is carried on.
         initial: A belief, or its mean (n,) with the paper's standard deviation of 0.1.
+        resting_input: That a model with a past remembers at first (m,); zero by
+            default.
     """
 
-    def __init__(self, loop: ModelLoop, initial: Any):
+    def __init__(
+        self, loop: ModelLoop, initial: Any, resting_input: Array | None = None
+    ):
         self.loop = loop
         self._steps = 0
         model = loop.model
         mean = initial.mean if isinstance(initial, Gaussian) else initial
         n = model.state_dim
-        if np.size(mean) == measured_dim(model):
+        if np.shape(mean) == (measured_dim(model),):
             n = measured_dim(model)
         options: Any = {"device": model.device, "dtype": model.dtype}
         mean = initial
@@ -290,9 +294,14 @@ class ModelSimulator:
             mean = belief.mean
             covariance = belief.covariance
         mean = torch.as_tensor(_check_state(mean, n, names), **options)
-        #: over all of the state, from the first step on
         self._belief = Gaussian(mean, covariance.to(**options))
         self._measured_dim = n
+        if has_past(model) and n < model.state_dim:
+            input = resting_input
+            if input is None:
+                input = np.zeros(model.input_dim)
+            state = model.at_rest(to_array(self._belief.mean), input)
+            self._belief = belief_of_all(self._belief, state)
 
     @property
     def mean(self) -> Array:
@@ -329,12 +338,7 @@ class ModelSimulator:
         Returns the input (m,), or why the belief cannot go on.
         """
         control = torch.as_tensor(np.asarray(input, dtype=float)).to(self._belief.mean)
-        belief = self._belief
-        model = self.loop.model
-        if has_past(model) and len(belief.mean) < model.state_dim:
-            state = model.at_rest(to_array(belief.mean), to_array(control))
-            belief = belief_of_all(belief, state)
-        belief = self.loop.propagator(model, belief, control)
+        belief = self.loop.propagator(self.loop.model, self._belief, control)
         mean_is_finite = torch.isfinite(belief.mean).all()
         covariance_is_finite = torch.isfinite(belief.covariance).all()
         if not (mean_is_finite and covariance_is_finite):

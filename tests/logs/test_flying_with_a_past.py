@@ -1,0 +1,216 @@
+"""Loops keep what the state of a model holds beside what is measured."""
+
+import numpy as np
+import pytest
+import torch
+
+from gpmpc.gaussian import Gaussian
+from gpmpc.models import DelayedModel, KnownModel, LogDynamics, LogModel
+from gpmpc.models._kinematics import Increments
+from gpmpc.models._log_dynamics import OutputNoise
+from gpmpc.models._memory import Memory
+from gpmpc.models._parametric import AffineNominal
+from gpmpc.models._state_space import StateGroup, StateSpace
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    ControlLoop,
+    Halfspaces,
+    Inequality,
+    LeastSquares,
+    ManyStarts,
+    Problem,
+    Tracking,
+)
+from gpmpc.propagation import Linearization
+from gpmpc.simulation import Dropout, ModelLoop, closed_loop, closed_loops
+from gpmpc.systems import System
+
+DT = 0.05
+LAG = 0.1  # time constant of the actuator [s]
+LATE = 2  # rows
+FOLLOWED = 0.4  # of a change of velocity in a row, once more in the next
+GOAL = np.array([1.0, 0.0])
+COST = Tracking([10.0, 1.0], [0.1], penalized="inputs")
+
+
+class Cart:
+    """A cart with a late and lagging motor: two of its six states are measured."""
+
+    stateful = True
+    state_names = ("x", "v")
+    input_names = ("u",)
+
+    def reset(self, seed):
+        self.measured = np.zeros(2)
+        self.force = self.last_velocity = 0.0
+        self.queue = [0.0] * LATE
+        return self.measured
+
+    def successor(self, x, u):
+        assert np.array_equal(x, self.measured)
+        self.queue.append(float(u[0]))
+        command = self.queue.pop(0)
+        decay = np.exp(-DT / LAG)
+        acting = command + (self.force - command) * (1 - decay) * LAG / DT
+        self.force = command + decay * (self.force - command)
+        gain = FOLLOWED * (x[1] - self.last_velocity)
+        self.last_velocity = x[1]
+        self.measured = x + DT * np.array([x[1], acting]) + np.array([0.0, gain])
+        return self.measured
+
+
+PLANT = System(Cart(), DT)
+
+
+def dynamics(noise=0.0):
+    """The cart as a model of a log knows it."""
+    groups = (StateGroup("x", ("x",)), StateGroup("v", ("v",)))
+    kinematics = Increments(StateSpace(groups))
+    weights = np.zeros((2, 7))  # of (x, v, u), their differences from the last, and 1
+    weights[1, 4] = FOLLOWED / DT
+    model = LogModel(
+        kinematics=kinematics,
+        nominal=AffineNominal(kinematics),
+        theta=np.array([[0, 1.0, 0, 0], [0, 0, 1.0, 0]]).ravel(),
+        history=(0, 0),
+        lag=LATE,
+        time_constants=np.array([LAG]),
+        memory=Memory(rows=1),
+        weights=weights,
+    )
+    variances = OutputNoise(np.zeros((4, 2)), np.full(2, noise))
+    return LogDynamics(model, 1, DT, variances)
+
+
+def controller(model, constraints=(), outputs=()):
+    """A controller that weighs what is measured."""
+    problem = Problem(COST, Box([-3.0], [3.0]), None, constraints, outputs)
+    propagator = Linearization(process_noise=True)
+    return GPMPC(model, propagator, problem, 25, [0.0])
+
+
+def from_many_starts():
+    """A search for the plan, as short as it may be."""
+    pilot = controller(dynamics(1e-6))
+    return ManyStarts(pilot, guesses=[None], turns=1, budget=1e-6)
+
+
+@pytest.mark.parametrize(
+    "made", [lambda: controller(dynamics(1e-6)), from_many_starts], ids=["one", "many"]
+)
+def test_what_is_not_measured_is_kept_from_step_to_step(made):
+    pilot = made()
+    steps = []
+    flown = closed_loop(PLANT, pilot, GOAL, None, 50, on_step=steps.append)
+    assert abs(flown.states[-1] - GOAL).max() < 1e-2
+    assert flown.judgement.level == "healthy"
+    # The model knows all that the plant does.
+    np.testing.assert_allclose(flown.predicted_means, flown.states[1:], atol=1e-9)
+    # Plans and tubes are of what is measured.
+    plan = steps[5].decision
+    assert (plan.means.shape, plan.covariances.shape) == ((26, 2), (26, 2, 2))
+    assert (plan.covariances[1:].diagonal(axis1=1, axis2=2) > 0).all()
+
+
+def test_a_dropout_is_bridged_by_the_model():
+    pilot = controller(dynamics())
+    flown = closed_loop(
+        PLANT, pilot, GOAL, None, 30, on_failure="previous_plan",
+        disturbances=[Dropout(start=0.5, stop=0.7)],
+    )  # fmt: skip
+    assert {status.name for status in flown.statuses[10:14]} == {"INVALID_MEASUREMENT"}
+    np.testing.assert_allclose(flown.predicted_means[14:], flown.states[15:], atol=1e-9)
+
+
+def test_constraints_and_outputs_see_what_is_measured():
+    seen = []
+
+    def height(x, u):
+        seen.append(x.shape[1])
+        return x[:, :1] - 0.5
+
+    pilot = controller(
+        dynamics(),
+        constraints=[
+            Box([-9.0, -0.5], [9.0, 0.5]),
+            Halfspaces([[1.0, 1.0]], [5.0]),
+            Inequality(lambda x: x[:, 0] - 0.8),
+        ],
+        outputs=[LeastSquares(height, [0.01])],
+    )
+    flown = closed_loop(PLANT, pilot, GOAL, None, 45)
+    assert set(seen) == {2}
+    assert flown.states[:, 1].max() < 0.501
+    assert 0.75 < flown.states[-1, 0] < 0.801
+
+
+def test_a_loop_of_ones_own_keeps_it_as_well():
+    flown = closed_loop(PLANT, controller(dynamics()), GOAL, None, 8)
+    loop = ControlLoop(controller(dynamics()))
+    for state, applied in zip(flown.states, flown.inputs, strict=False):
+        np.testing.assert_array_equal(loop.input(state, GOAL), applied)
+    assert loop.judgement.level == "healthy"
+    planned = loop.last.decision.means[0]
+    expected = loop.last.decision.inputs[0]
+    np.testing.assert_allclose(loop.input_between(planned, 0.0), expected)
+    pushed = loop.input_between(planned + np.array([0.1, 0.0]), 0.0)
+    assert pushed < expected
+
+
+def test_stability_is_judged_with_the_past():
+    steady = controller(dynamics()).stability(GOAL)
+    assert steady.stable
+    np.testing.assert_allclose(steady.states, [GOAL], atol=1e-6)
+    late = DelayedModel(dynamics(), 8)
+    assert not controller(dynamics()).stability(GOAL, plant=late).stable
+
+
+def test_a_model_loop_carries_the_past_on():
+    model = dynamics()
+    flown = closed_loop(
+        ModelLoop(model, Linearization()), controller(model), GOAL,
+        Gaussian.certain([0.0, 0.0]), 60,
+    )  # fmt: skip
+    assert flown.states.shape == (61, 2)
+    np.testing.assert_allclose(flown.predicted_means, flown.states[1:], atol=1e-9)
+
+
+def test_a_delay_is_kept_like_any_other_past():
+    A = torch.tensor([[1.0, DT], [0.0, 1.0]], dtype=torch.float64)
+    B = torch.tensor([[0.0], [DT]], dtype=torch.float64)
+    cart = KnownModel(lambda x, u: x @ A.mT + u @ B.mT, 2, 1)
+    pilot = controller(DelayedModel(cart, 1.5))
+
+    class Delayed(Cart):
+        def successor(self, x, u):
+            self.queue.append(float(u[0]))
+            acting = 0.5 * (self.queue[0] + self.queue[1])
+            self.queue.pop(0)
+            self.measured = x + DT * np.array([x[1], acting])
+            return self.measured
+
+    flown = closed_loop(System(Delayed(), DT), pilot, GOAL, None, 60)
+    np.testing.assert_allclose(flown.predicted_means, flown.states[1:], atol=1e-9)
+    assert abs(flown.states[-1] - GOAL).max() < 1e-2
+
+    class Plain:
+        state_names = ("x", "v")
+        input_names = ("u",)
+
+        def derivative(self, x, u):
+            return [x[1], u[0]]
+
+    plant = System(Plain(), DT)
+    start = Gaussian.certain([0.0, 0.0])
+    trials = closed_loops(plant, pilot, GOAL, start, 5, 3)
+    alone = closed_loop(plant, pilot, GOAL, start, 5, seed=2)
+    np.testing.assert_allclose(trials[2].result.states, alone.states, atol=1e-12)
+
+
+def test_models_of_logs_are_compared_by_identity():
+    one = dynamics()
+    other = dynamics()
+    assert one != other
+    assert one.model != other.model
+    assert one.model in [other.model, one.model]
