@@ -47,6 +47,7 @@ from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel, OutputGP
 from gpmpc.models._parametric import AffineNominal
 
+_WINDOWS_OF_LAGS = 4  # that a log is to hold where inputs act through lags
 PAST_ROWS = MOST_PAST  # of the windows that structures are compared on
 _AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
 _JUDGED = (1, 10, 50)  # steps whose errors decide
@@ -226,7 +227,25 @@ class Search:
                 if addition is not removed and smaller is not None:
                     smaller = smaller.extended(addition)
             neighbours.append(smaller)
-        return [neighbour for neighbour in neighbours if neighbour is not None]
+        return [one for one in neighbours if one is not None and self._has_rows(one)]
+
+    def _has_rows(self, structure: Structure) -> bool:
+        """Returns whether lags can be fitted, and judged on rows that were held out.
+
+        Every fold needs a piece as long as a window, and the log several of them: a
+        fifth of it may be all that it is judged on.
+        """
+        model = structure.model
+        if not len(model.time_constants):
+            return True
+        needed = model.past + self._steps + 1
+        if len(self._log) < _WINDOWS_OF_LAGS * needed:
+            return False
+        return all(
+            max(end - begin for run in fold.train for begin, end in run.pieces)
+            >= needed
+            for fold in self._folds
+        )
 
     def _base_of(self, structure: Structure) -> Structure:
         """Returns the base that a structure grew from."""

@@ -85,7 +85,8 @@ def dynamics(noise=0.0):
 
 def controller(model, constraints=(), outputs=()):
     """A controller that weighs what is measured."""
-    problem = Problem(COST, Box([-3.0], [3.0]), None, constraints, outputs)
+    inputs = Box([-3.0], [3.0])
+    problem = Problem(COST, inputs, constraints=constraints, outputs=outputs)
     propagator = Linearization(process_noise=True)
     return GPMPC(model, propagator, problem, 25, [0.0])
 
@@ -150,7 +151,10 @@ def test_a_loop_of_ones_own_keeps_it_as_well():
     loop = ControlLoop(controller(dynamics()))
     for state, applied in zip(flown.states, flown.inputs, strict=False):
         np.testing.assert_array_equal(loop.input(state, GOAL), applied)
+    assert loop.judgement is not None
     assert loop.judgement.level == "healthy"
+    assert loop.last is not None
+    assert loop.last.decision is not None
     planned = loop.last.decision.means[0]
     expected = loop.last.decision.inputs[0]
     np.testing.assert_allclose(loop.input_between(planned, 0.0), expected)
@@ -205,7 +209,9 @@ def test_a_delay_is_kept_like_any_other_past():
     start = Gaussian.certain([0.0, 0.0])
     trials = closed_loops(plant, pilot, GOAL, start, 5, 3)
     alone = closed_loop(plant, pilot, GOAL, start, 5, seed=2)
-    np.testing.assert_allclose(trials[2].result.states, alone.states, atol=1e-12)
+    together = trials[2].result
+    assert together is not None
+    np.testing.assert_allclose(together.states, alone.states, atol=1e-12)
 
 
 def test_models_of_logs_are_compared_by_identity():
