@@ -23,7 +23,11 @@ _log = logging.getLogger(__name__)
 
 
 class Linearized(NamedTuple):
-    """First-order expansions of a model at K points, as C-contiguous float64 arrays."""
+    """First-order expansions of a model at K points, as C-contiguous float64 arrays.
+
+    See Also:
+        ``linearize``, which returns it.
+    """
 
     mean: Array  #: next states f(x, u), or k other outputs (K, k)
     A: Array  #: derivatives of the means by the state (K, k, n)
@@ -39,6 +43,10 @@ class DynamicsModel(Protocol):
     ``gpmpc.testing.check_model`` tests a model against this protocol.
     ``linearize_by_autograd`` is a ready-made ``linearize`` for models that torch can
     differentiate.
+
+    See Also:
+        ``gpmpc.testing.check_model``, which tells what a model of one's own
+        lacks; ``linearize``.
     """
 
     @property
@@ -125,6 +133,15 @@ def linearize(
         states: x (K, n).
         inputs: u (K, m).
         covariance: Whether the covariances at the points are computed.
+
+    >>> import numpy as np
+    >>> from gpmpc.models import KnownModel
+    >>> model = KnownModel(lambda x, u: 0.9 * x + u, state_dim=1, input_dim=1)
+    >>> linearize(model, np.ones((1, 1)), np.zeros((1, 1))).A.round(6).tolist()
+    [[[0.9]]]
+
+    See Also:
+        ``linearize_by_autograd``; ``gpmpc.propagation.linearize`` for beliefs.
     """
     return linearization_of(model)(states, inputs, covariance)
 
@@ -141,6 +158,9 @@ def linearize_by_autograd(
         states: x (K, n).
         inputs: u (K, m).
         covariance: Whether the covariances at the points are computed.
+
+    See Also:
+        ``linearize``, which uses a model's own derivatives where it has them.
     """
     _log_slow(type(model).__name__)
     state, input = tensors_for(model, states, inputs)

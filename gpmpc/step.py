@@ -12,7 +12,11 @@ if TYPE_CHECKING:  # recordings are read without torch
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One time step of a closed loop, n states and m inputs."""
+    """One time step of a closed loop, n states and m inputs.
+
+    See Also:
+        ``closed_loop(..., on_step=...)``, which hands it on; ``Rollout``.
+    """
 
     time: float  # time since the start of the run [s]
     k: int  # number of the step, from 0

@@ -5,8 +5,10 @@
 
 import doctest
 import importlib
+import inspect
 import pkgutil
 import re
+from pydoc import locate
 
 import numpy as np
 import pytest
@@ -122,6 +124,42 @@ def test_the_examples_in_docstrings_print_what_they_show(path):
     done = doctest.testmod(module, optionflags=doctest.IGNORE_EXCEPTION_DETAIL)
     assert done.attempted
     assert not done.failed
+
+
+ROOMS = ("models", "mpc", "systems", "simulation", "logs", "gp", "propagation")
+PUBLIC = [
+    (room, name)
+    for room in (*ROOMS, "estimation")
+    for name in importlib.import_module(f"gpmpc.{room}").__all__
+    if callable(getattr(importlib.import_module(f"gpmpc.{room}"), name))
+]
+
+
+def page_of(room, name):
+    """The docstring of a public object, and what stands under its See Also."""
+    text = inspect.getdoc(getattr(importlib.import_module(f"gpmpc.{room}"), name))
+    assert text, name
+    return text, text.partition("See Also:")[2]
+
+
+def test_every_public_object_has_an_example_or_leads_to_one():
+    texts = {(room, name): page_of(room, name)[0] for room, name in PUBLIC}
+    assert len(texts) > 170
+    assert not [
+        key
+        for key, text in texts.items()
+        if ">>>" not in text and "See Also:" not in text
+    ]
+
+
+def test_what_pages_of_objects_lead_to_is_there():
+    missing = []
+    for room, name in PUBLIC:
+        for named in re.findall(r"``([\w.]+)[`(]", page_of(room, name)[1]):
+            places = [named, f"gpmpc.{room}.{named}", f"gpmpc.{room}.{name}.{named}"]
+            if not any(map(locate, places)):
+                missing.append((room, name, named))
+    assert not missing
 
 
 def test_every_page_with_python_is_followed_by_a_test():

@@ -50,7 +50,11 @@ from gpmpc.propagation import Propagator, rollout
 
 @dataclass(frozen=True)
 class ConformalTube:
-    """Scores of held-out predictions, and the standard deviations that follow."""
+    """Scores of held-out predictions, and the standard deviations that follow.
+
+    See Also:
+        ``AdaptiveTube``, which follows what happens in flight.
+    """
 
     scores: Array  #: those of each stage in a column (N, H), which are sorted
     rows: Array  #: the directions g (r, n) that were compared
@@ -170,6 +174,9 @@ class AdaptiveTube:
     Raises:
         SettingError: A probability not between 0 and 1, a rate that is not positive, or
             too few decisions to say so.
+
+    See Also:
+        ``ConformalTube``, which it begins with.
     """
 
     def __init__(

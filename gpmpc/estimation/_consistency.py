@@ -23,7 +23,11 @@ from gpmpc.gaussian import Gaussian
 
 @dataclass(frozen=True)
 class Consistency:
-    """Normalised squared errors, and the band that their mean should lie in."""
+    """Normalised squared errors, and the band that their mean should lie in.
+
+    See Also:
+        ``normalized_errors``, which returns it.
+    """
 
     values: np.ndarray  #: one an error (N,); errors without a finite entry are left out
     degrees: (
@@ -63,6 +67,16 @@ def normalized_errors(
     Raises:
         ShapeError: The two do not belong together.
         DataError: No error is finite.
+
+    >>> import numpy as np
+    >>> errors = np.random.default_rng(0).normal(size=(500, 2))
+    >>> found = normalized_errors(errors, np.tile(np.eye(2), (500, 1, 1)))
+    >>> low, high = found.band
+    >>> bool(low < found.values.sum() / found.degrees.sum() < high)
+    True
+
+    See Also:
+        ``estimation_errors``; ``autocorrelation``.
     """
     e = torch.as_tensor(errors, dtype=torch.float64)
     P = torch.as_tensor(covariances, dtype=torch.float64)
@@ -94,7 +108,18 @@ def normalized_errors(
 
 
 def estimation_errors(belief: Gaussian, states: Any, angles: Any = ()) -> Tensor:
-    """Computes the errors x - mu (..., n) of beliefs; of angles, within half a turn."""
+    """Computes the errors x - mu (..., n) of beliefs; of angles, within half a turn.
+
+    >>> import torch
+    >>> from gpmpc.gaussian import Gaussian
+    >>> belief = Gaussian.certain(torch.tensor([3.0]).double())
+    >>> state = torch.tensor([-3.0]).double()
+    >>> estimation_errors(belief, state, angles=[0]).round(decimals=2).tolist()
+    [0.28]
+
+    See Also:
+        ``normalized_errors``.
+    """
     truth = torch.as_tensor(states, dtype=belief.mean.dtype)
     return state_difference(truth, belief.mean, angles)
 
@@ -109,6 +134,15 @@ def autocorrelation(
 
     Raises:
         DataError: Fewer than two pairs are finite.
+
+    >>> import numpy as np
+    >>> innovations = np.random.default_rng(0).normal(size=(500, 1))
+    >>> value, bound = autocorrelation(innovations, np.ones((500, 1, 1)))
+    >>> abs(value) < bound
+    True
+
+    See Also:
+        ``normalized_errors``; ``FilterRun``, which has innovations.
     """
     e = torch.as_tensor(innovations, dtype=torch.float64)
     S = torch.as_tensor(covariances, dtype=torch.float64)

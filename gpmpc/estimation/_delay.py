@@ -35,7 +35,11 @@ _RIDGE = 1e-9  # of columns of unit square: some draws of rows do not tell them 
 
 @dataclass(frozen=True)
 class DelayEstimate:
-    """An estimated delay."""
+    """An estimated delay.
+
+    See Also:
+        ``estimate_delay``, which returns it.
+    """
 
     steps: float  #: the delay with the largest correlation [steps]
     #: that holds the delay with the confidence asked for [steps]
@@ -73,6 +77,15 @@ def estimate_delay(
         DataError: There are too few rows, or an entry is not finite; or the data cannot
             tell: no state changes, an input is constant, two of them move alike, or
             they are functions of the state (feedback alone).
+
+    >>> import numpy as np
+    >>> inputs = np.random.default_rng(0).normal(size=(200, 1))
+    >>> late = np.vstack([np.zeros((3, 1)), inputs[:-2]]).cumsum(axis=0)
+    >>> round(estimate_delay(late, inputs, longest=5).steps)
+    2
+
+    See Also:
+        ``gpmpc.models.DelayedModel``, which holds inputs back.
     """
     x = np.asarray(states, dtype=float)
     u = np.asarray(inputs, dtype=float)

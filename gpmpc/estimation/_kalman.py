@@ -204,7 +204,11 @@ class _Selection:
 
 @dataclass(frozen=True)
 class Update:
-    """A belief after a measurement, and the innovation."""
+    """A belief after a measurement, and the innovation.
+
+    See Also:
+        ``KalmanFilter``, which returns it.
+    """
 
     belief: Gaussian  #: over the state (*batch, n)
     innovation: Tensor  #: y - E[y] (*batch, p), NaN where nothing was measured
@@ -213,7 +217,11 @@ class Update:
 
 @dataclass(frozen=True)
 class FilterRun:
-    """A log of T steps, filtered; see ``KalmanFilter.run``."""
+    """A log of T steps, filtered; see ``KalmanFilter.run``.
+
+    See Also:
+        ``KalmanFilter.run``, which returns it; ``smooth``.
+    """
 
     predicted: Gaussian  #: beliefs before the measurements (T + 1, n), (T + 1, n, n)
     filtered: Gaussian  #: beliefs after them
@@ -417,6 +425,9 @@ def smooth(run: FilterRun) -> Gaussian:
     This is the smoother of Rauch, Tung and Striebel (1965), with the covariances
     Cov[x_k, x_{k+1}] of the propagator, which makes it the unscented one of Sarkka
     (2008) where the filter is unscented.
+
+    See Also:
+        ``KalmanFilter.run``, which makes the run.
     """
     mean = run.filtered.mean[-1]
     covariance = run.filtered.covariance[-1]
@@ -449,6 +460,9 @@ class LateMeasurements:
 
     Raises:
         SettingError: ``longest`` is no whole number of zero or more.
+
+    See Also:
+        ``KalmanFilter``, which it holds.
     """
 
     def __init__(self, filter: KalmanFilter, belief: Gaussian, longest: int = 10):

@@ -69,7 +69,11 @@ _LARGEST_RESPONSE = 10.0  # change of a working response by one residual, at mos
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """The noise of a process, an entry an output."""
+    """The noise of a process, an entry an output.
+
+    See Also:
+        ``estimate_process_noise``, which returns it.
+    """
 
     variance: Tensor  #: sigma^2 of a step (k,)
     #: rho, of the noise of a step with the next's (k,); NaN where rows are in no order
@@ -101,6 +105,19 @@ def estimate_process_noise(
     Raises:
         ShapeError: The transitions have other dimensions.
         DataError: There are fewer than ten rows.
+
+    >>> from gpmpc.datasets import RandomData
+    >>> from gpmpc.gp import Trainer
+    >>> from gpmpc.systems import double_integrator
+    >>> pushes = RandomData(samples=60, noise=[0.01, 0.01])
+    >>> data = pushes.transitions(double_integrator())
+    >>> gp = Trainer(predicts="difference", restarts=0)(data[:30]).posterior
+    >>> noise = estimate_process_noise(gp, data[30:])
+    >>> noise.variance.sqrt().round(decimals=2).tolist()
+    [0.01, 0.01]
+
+    See Also:
+        ``with_process_noise``, which gives it to GPs; ``separate_noise``.
     """
     errors, latent = residuals(model, transitions, block)
     squares = errors.square()
@@ -143,6 +160,9 @@ def with_process_noise(
     Raises:
         UnsupportedModel: The posterior holds a sparse model's pseudo-observations.
         ShapeError: The number of outputs is another one.
+
+    See Also:
+        ``estimate_process_noise``, which finds it.
     """
     variance = noise.variance if isinstance(noise, ProcessNoise) else noise
     if not isinstance(posterior, GPPosterior) or not posterior.has_observation_noise:
@@ -252,7 +272,11 @@ def _trained_gp(model: Any, states: Tensor, inputs: Tensor) -> _TrainedGP | None
 
 @dataclass(frozen=True)
 class VaryingNoise:
-    """The outputs whose noise varies, and the model that predicts it."""
+    """The outputs whose noise varies, and the model that predicts it.
+
+    See Also:
+        ``estimate_varying_noise``, which returns it.
+    """
 
     #: a ``NoisyModel``; the model that was given where no output's noise varies
     model: Any
@@ -281,6 +305,9 @@ def estimate_varying_noise(
         ShapeError: The transitions have other dimensions.
         DataError: There are fewer than ten blocks.
         TrainingError: The GP of an output could not be trained.
+
+    See Also:
+        ``gpmpc.models.NoisyModel``, which it makes.
     """
     missed = residuals(model, transitions, block)
     errors = missed.errors.cpu().double()

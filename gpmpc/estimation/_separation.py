@@ -31,7 +31,11 @@ _FLOOR = 0.01  # of the learned variance: what is always left to the process
 
 @dataclass(frozen=True)
 class SeparatedNoise:
-    """The two parts of a model's noise."""
+    """The two parts of a model's noise.
+
+    See Also:
+        ``separate_noise``, which returns it.
+    """
 
     model: DynamicsModel  #: the same predictions, with the noise of the process alone
     process: Tensor  #: variances of what moves the state in a step (n,)
@@ -56,6 +60,10 @@ def separate_noise(
             pseudo-observations.
         ShapeError: The transitions have other dimensions.
         DataError: Fewer than twenty rows follow one another.
+
+    See Also:
+        ``SeparatedNoise``, its result; ``gpmpc.calibration.calibrate``, which
+        says whether intervals hold.
     """
     gp = getattr(model, "residual", model)
     constant = not callable(getattr(model, "B", None))

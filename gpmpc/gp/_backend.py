@@ -31,6 +31,9 @@ def backend(choice: _Backend) -> Iterator[None]:
     Raises:
         SettingError: Another word; within the block, ``"compiled"`` where only torch
             can evaluate.
+
+    See Also:
+        ``gpmpc.mpc.GPMPC``, whose decisions are compiled by default.
     """
     check_choice("backend", choice, get_args(_Backend))
     token = _chosen.set(choice)

@@ -77,6 +77,9 @@ def to_gpytorch(posterior: GPPosterior) -> BatchExactGP:
     """Builds the GPyTorch model of a posterior.
 
     Its prior mean is a constant that training leaves alone.
+
+    See Also:
+        ``from_gpytorch``, the way back.
     """
     model = BatchExactGP(posterior.features, posterior.targets)
     model.signals = posterior.signals
@@ -124,6 +127,9 @@ def from_gpytorch(
             distribution of its mean and kernel modules.
         ShapeError: The models of a list have other training inputs or inducing points,
             or there is more than one batch dimension.
+
+    See Also:
+        ``to_gpytorch``, the way back; ``gpmpc.models.train``.
     """
     signals = signals_of(model) if signals is None else signals
     check_signals(signals)

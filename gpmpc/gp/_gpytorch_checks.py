@@ -27,7 +27,11 @@ _REMEDY = (
 
 @contextmanager
 def exact_inference() -> Iterator[None]:
-    """Keeps GPyTorch on the exact Cholesky factorisation in a ``with`` block."""
+    """Keeps GPyTorch on the exact Cholesky factorisation in a ``with`` block.
+
+    See Also:
+        ``to_gpytorch``, whose predictions it keeps exact.
+    """
     settings = gpytorch.settings
     with (
         settings.fast_computations(False, False, False),

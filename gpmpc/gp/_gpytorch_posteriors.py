@@ -45,6 +45,9 @@ class KernelPosterior(TensorModel):
 
     It works with every propagation but ``MomentMatching``, which has a closed form for
     the SE-ARD kernel only.
+
+    See Also:
+        ``from_gpytorch``, which makes one; ``GPPosterior`` with SE kernels.
     """
 
     #: one a GPyTorch model, each with one output or a batch of them

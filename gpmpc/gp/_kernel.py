@@ -147,7 +147,11 @@ def _factorize_in_place(
 
 
 class Hyperparameters(NamedTuple):
-    """Hyperparameters of k SE-ARD GPs over d features."""
+    """Hyperparameters of k SE-ARD GPs over d features.
+
+    See Also:
+        ``GPPosterior.from_hyperparameters``, which takes them.
+    """
 
     lengthscales: Tensor  #: (k, d)
     signal_variance: Tensor  #: sf2 (k,)

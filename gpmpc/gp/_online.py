@@ -60,6 +60,18 @@ def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPo
         UnsupportedModel: The GPs predict values, which transitions do not hold: use
             ``append_points``.
         SettingError: The larger kernel matrix is not positive definite in this dtype.
+
+    >>> from gpmpc.datasets import RandomData
+    >>> from gpmpc.gp import Trainer
+    >>> from gpmpc.systems import double_integrator
+    >>> data = RandomData(samples=12).transitions(double_integrator())
+    >>> gp = Trainer(predicts="difference", restarts=0)(data[:10]).posterior
+    >>> len(append_transitions(gp, data[10:]))
+    12
+
+    See Also:
+        ``append_points``; ``remove_points``; ``Trainer.refit``, which trains
+        anew.
     """
     targets = targets_of(posterior, transitions)
     return append_points(posterior, transitions.features, targets)
@@ -79,6 +91,9 @@ def append_points(
         ShapeError: The points have other dimensions.
         SettingError: The larger kernel matrix is not positive definite in this dtype.
         DataError: An entry is not finite.
+
+    See Also:
+        ``append_transitions``; ``remove_points``; ``SlidingWindow``.
     """
     features, targets = _checked_points(posterior, features, targets)
     size = len(posterior)
@@ -154,6 +169,9 @@ def remove_points(
     Raises:
         SettingError: An index is out of range or stands there twice.
         DataError: No point is left.
+
+    See Also:
+        ``append_points``; ``SlidingWindow``.
     """
     size = len(posterior)
     removed = _checked_indices(indices, size)
@@ -224,6 +242,13 @@ class SlidingWindow:
 
     Raises:
         SettingError: Fewer than one point, or an unknown rule.
+
+    >>> SlidingWindow(points=100, remove="least_informative").points
+    100
+
+    See Also:
+        ``append_points``, without a limit; ``gpmpc.learning`` for learning in
+        flight.
     """
 
     points: int  #: how many points the posterior may hold

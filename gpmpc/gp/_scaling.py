@@ -15,7 +15,17 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Scaling:
-    """An affine map of every column, scaled = (value - offset) / factor."""
+    """An affine map of every column, scaled = (value - offset) / factor.
+
+    >>> import torch
+    >>> scaling = Scaling(offset=torch.tensor([1.0]), factor=torch.tensor([2.0]))
+    >>> scaling.scale(torch.tensor([[5.0]])).tolist()
+    [[2.0]]
+
+    See Also:
+        ``standardize``, ``centre``, ``min_max`` and ``identity``, which make
+        one of data.
+    """
 
     offset: Tensor  #: (d,), in the units of the data
     factor: Tensor  #: (d,), in the units of the data; positive
@@ -43,14 +53,30 @@ class Scaling:
 
 
 def identity(columns: Tensor, names: Sequence[str] = ()) -> Scaling:
-    """Leaves columns (N, d) as they are."""
+    """Leaves columns (N, d) as they are.
+
+    >>> import torch
+    >>> identity(torch.tensor([[1.0], [3.0]])).factor.tolist()
+    [1.0]
+
+    See Also:
+        ``standardize``; ``centre``.
+    """
     return Scaling(
         offset=torch.zeros_like(columns[0]), factor=torch.ones_like(columns[0])
     )
 
 
 def centre(columns: Tensor, names: Sequence[str] = ()) -> Scaling:
-    """Maps columns (N, d) to mean zero and keeps their units."""
+    """Maps columns (N, d) to mean zero and keeps their units.
+
+    >>> import torch
+    >>> centre(torch.tensor([[1.0], [3.0]])).offset.tolist()
+    [2.0]
+
+    See Also:
+        ``standardize``, which scales as well.
+    """
     mean = columns[0] + (columns - columns[0]).mean(dim=0)
     return Scaling(offset=mean, factor=torch.ones_like(mean))
 
@@ -89,6 +115,14 @@ def min_max(
 
     Raises:
         SettingError: low is not below high.
+
+    >>> import torch
+    >>> scaling = min_max(torch.tensor([[1.0], [3.0]]), ["x"], low=0.0, high=1.0)
+    >>> scaling.scale(torch.tensor([[2.0]])).tolist()
+    [[0.5]]
+
+    See Also:
+        ``standardize``, which outliers move less.
     """
     if not low < high:
         raise SettingError("low, high", f"low must be below high; got {low}, {high}")

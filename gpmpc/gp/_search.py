@@ -57,6 +57,14 @@ class SoftLimits:
     ((log l_d - log std(x~_d)) / log r)^p summed over d, and (log(sf / sn) / log s)^p;
     the penalties of PILCO (Deisenroth, 2010) and of the experiment of Cao, Lai and Alam
     (2017). Nearly flat inside, steep outside, for where the data leave them open.
+
+    >>> import numpy as np
+    >>> value, _ = SoftLimits(lengthscale_factor=10.0)(np.zeros(3), log_std=np.zeros(1))
+    >>> float(value)
+    0.0
+
+    See Also:
+        ``Trainer(penalty=...)``, which adds it.
     """
 
     #: r, how far a length-scale may be from its feature's standard deviation

@@ -70,6 +70,9 @@ class SparseTrainer:
 
     Raises:
         SettingError: A setting is out of range.
+
+    See Also:
+        ``Trainer`` for up to some thousand points; ``informative_points``.
     """
 
     inducing: int = 100  #: M; no more than there are distinct points
@@ -343,6 +346,9 @@ def informative_points(
     A pivoted Cholesky factorisation of sum_a K_a / sn2_a's diagonal. Fewer than
     ``count`` come back where nothing is left to explain: less than round-off of every
     output's variance.
+
+    See Also:
+        ``SparseTrainer``; ``SlidingWindow``.
     """
     lengthscales, signal_variance, noise_variance = hyperparameters
     round_off = 1e-10 * signal_variance

@@ -104,6 +104,9 @@ def load_metadata(path: str | Path) -> dict[str, Any]:
     """Reads the header of a model file.
 
     It has kind, dimensions, versions, and the metadata that the model was saved with.
+
+    See Also:
+        ``load_posterior``, which reads the whole file.
     """
     path = existing_file(path, "a saved model")
     header, _ = _content(path, "model", header_only=True)

@@ -60,7 +60,11 @@ _ONE_THREAD = 1000
 
 @dataclass(frozen=True)
 class Training:
-    """The result of a training."""
+    """The result of a training.
+
+    See Also:
+        ``Trainer`` and ``SparseTrainer``, which return it.
+    """
 
     #: the trained GPs, frozen; of a sparse training, to M pseudo-observations at the
     #: inducing points
@@ -383,6 +387,15 @@ def train(transitions: Transitions, seed: int = 0, **settings: Any) -> Training:
     """Fits one GP per output: ``Trainer(**settings)(transitions, seed)``.
 
     ``gpmpc.models.train`` takes a system as well, and learns what that leaves open.
+
+    >>> from gpmpc.datasets import RandomData
+    >>> from gpmpc.systems import double_integrator
+    >>> data = RandomData(samples=10).transitions(double_integrator())
+    >>> train(data, predicts="difference", restarts=0).posterior
+    GPPosterior(10 points, n=2, m=1, k=2, predicts='difference', torch.float64 on cpu)
+
+    See Also:
+        ``Trainer`` for the settings; ``SparseTrainer`` for thousands of rows.
     """
     if "system" in settings:
         raise SettingError("system", "is an argument of train of gpmpc.models")

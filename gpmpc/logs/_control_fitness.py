@@ -44,7 +44,11 @@ class Effect:
 
 @dataclass(frozen=True)
 class ControlFitness:
-    """Whether a controller can plan with a model."""
+    """Whether a controller can plan with a model.
+
+    See Also:
+        ``learn(..., for_control=True)``, which asks for it.
+    """
 
     effects: tuple[Effect, ...]  #: one of each input
     faults: tuple[str, ...]  #: why no controller should plan with it

@@ -67,6 +67,9 @@ def fit_nominal(
         ShapeError: theta0 has another length.
         DataError: No piece of the log is long enough, or the rollouts at theta0 are not
             finite.
+
+    See Also:
+        ``learn``, which fits and compares several.
     """
     check_kind("model", model, LogModel, "a LogModel")
     check_kind("log", log, Log, "a Log of read_log")

@@ -56,7 +56,11 @@ JITTER = 0.1  # of the time step, from which on a rate should be stated
 
 @dataclass(frozen=True)
 class Inspection:
-    """The content of a log file; shares lie between 0 and 1."""
+    """The content of a log file; shares lie between 0 and 1.
+
+    See Also:
+        ``inspect_log``, which returns it.
+    """
 
     title: str  #: the file and its size in words
     #: a row a stream; its jitter is the standard deviation over the time step
@@ -137,7 +141,7 @@ def inspect_log(
     time: str = "",
     time_step: float | None = None,
 ) -> Inspection:
-    """Inspects a log file, however broken its rows are.
+    r"""Inspects a log file, however broken its rows are.
 
     Args:
         path: In a format of ``read_log``.
@@ -151,6 +155,17 @@ def inspect_log(
     Raises:
         DataError: The file cannot be read, or a column that is named is missing.
         SettingError: ``mapping`` is of another kind, or times are said twice.
+
+    >>> import pathlib, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = pathlib.Path(folder, "drive.csv")
+    ...     _ = file.write_text("t,x\n0.0,0.0\n0.1,0.1\n0.2,0.2\n0.3,0.3\n")
+    ...     found = inspect_log(file)
+    >>> len(found.gaps)
+    0
+
+    See Also:
+        ``read_log``, which reads the runs.
     """
     if mapping is not None:
         check_kind("mapping", mapping, LogMapping, "a LogMapping")

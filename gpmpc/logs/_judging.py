@@ -40,6 +40,9 @@ class Judgement:
     """Errors of a model and of the baselines on held-out runs.
 
     ``gpmpc.mpc.Judgement`` is something else: it judges a step of a flight.
+
+    See Also:
+        ``judge``, which returns it.
     """
 
     groups: tuple[str, ...]  #: names of the groups of states
@@ -122,6 +125,9 @@ def judge(
     Raises:
         SettingError: An argument is of another kind, or there is no step.
         DataError: No piece of the held-out log is long enough.
+
+    See Also:
+        ``learn``; ``Judgement``, its result.
     """
     check_kind("learned", learned, IdentifiedModel, "what learn returns")
     check_kind("held_out", held_out, Log, "a Log of read_log")

@@ -30,7 +30,11 @@ from gpmpc.models._log_model import LogModel
 
 @dataclass(frozen=True)
 class IdentifiedModel:
-    """A model identified from a log, and the record of its identification."""
+    """A model identified from a log, and the record of its identification.
+
+    See Also:
+        ``learn``, which returns it; ``save_learned``.
+    """
 
     model: LogModel  #: fitted to all runs
     noise: OutputNoise  #: of its outputs
@@ -80,6 +84,9 @@ def learn(
         SettingError: ``log`` is no log, or a setting is out of range.
         DataError: The log is too short for rollouts of that many steps.
         TrainingError: A GP could not be trained.
+
+    See Also:
+        ``read_log``, whose runs it takes; ``judge``; ``save_learned``.
     """
     check_kind("log", log, Log, "a Log of read_log")
     check_number("points", points, least=10, whole=True)

@@ -87,6 +87,9 @@ class Log:
 
     Raises:
         DataError: There is no run.
+
+    See Also:
+        ``read_log``, which returns it.
     """
 
     mapping: LogMapping  #: what the columns mean

@@ -214,7 +214,11 @@ class RoleValues(NamedTuple):
 
 @dataclass(frozen=True)
 class LogMapping:
-    """What a log's columns mean, and how its rows are read."""
+    """What a log's columns mean, and how its rows are read.
+
+    See Also:
+        ``read_log``, which takes it, or a dictionary of the same keys.
+    """
 
     signals: tuple[Signal, ...]  #: states, inputs and context, in this order
     time: str = ""  #: column of the stamps; empty takes the stamps of the messages

@@ -31,7 +31,7 @@ def read_log(
     mapping: LogMapping | Mapping[str, Any] | str | Path,
     partial: bool = False,
 ) -> Log:
-    """Reads the runs of one file or several.
+    r"""Reads the runs of one file or several.
 
     Args:
         files: Of the kinds in docs/log_files.md.
@@ -43,6 +43,22 @@ def read_log(
         DataError: A file, topic or column is missing or cannot be used; the text says
             where and why.
         SettingError: The mapping is wrong.
+
+    >>> import pathlib, tempfile
+    >>> mapping = {
+    ...     "time": {"column": "t", "unit": "s"},
+    ...     "states": {"x": {"columns": ["x"]}},
+    ...     "inputs": {"u": {"columns": ["u"]}},
+    ... }
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = pathlib.Path(folder, "drive.csv")
+    ...     _ = file.write_text("t,x,u\n0.0,0.0,1.0\n0.1,0.1,1.0\n0.2,0.2,0.5\n")
+    ...     log = read_log(file, mapping)
+    >>> log.time_step, len(log.runs)
+    (0.1, 1)
+
+    See Also:
+        ``inspect_log``, which says what a file holds; ``learn``.
     """
     paths = _as_paths(files)
     mapping = with_axes_of_files(_as_mapping(mapping), paths)

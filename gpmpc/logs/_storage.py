@@ -45,6 +45,9 @@ def save_learned(learned: IdentifiedModel, path: str | Path) -> None:
         SettingError: ``learned`` is of another kind, or its nominal model is a user's
             own, which a file of numbers cannot hold.
         DataError: The folder does not exist.
+
+    See Also:
+        ``load_learned``, which reads the file.
     """
     check_kind("learned", learned, IdentifiedModel, "what learn returns")
     path = new_file(path)
@@ -84,6 +87,9 @@ def load_learned(path: str | Path, trusted: Sequence[str] = ()) -> IdentifiedMod
     Raises:
         DataError: The file is missing, damaged, of another kind or of a newer format,
             or names code that is not trusted.
+
+    See Also:
+        ``save_learned``, which writes the file; ``load_flyable`` for any model.
     """
     packages = trusted_packages("trusted", trusted)
     path = existing_file(path, "what gpmpc learn saved")
@@ -134,7 +140,11 @@ def _learned_of_parts(
 
 @dataclass(frozen=True)
 class SavedModel:
-    """A model from a file, with the names that the file has for its signals."""
+    """A model from a file, with the names that the file has for its signals.
+
+    See Also:
+        ``load_flyable``, which returns it.
+    """
 
     path: str  #: of the file
     model: DynamicsModel  #: trained
@@ -172,6 +182,9 @@ def load_flyable(path: str | Path, trusted: Sequence[str] | None = None) -> Save
             is not trusted.
         SettingError: What is in it cannot be flown, or ``trusted`` is no list of names
             of packages.
+
+    See Also:
+        ``load_learned``; ``gpmpc.models.load_model``.
     """
     packages = trusted_packages("model.trusted", trusted)
     header = load_metadata(path)

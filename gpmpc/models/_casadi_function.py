@@ -22,6 +22,17 @@ class CasadiFunction:
     Raises:
         UnsupportedModel: It is no CasADi function, or has no argument, or more than one
             value.
+
+    >>> import numpy as np
+    >>> import casadi
+    >>> x, u = casadi.SX.sym("x", 2), casadi.SX.sym("u", 1)
+    >>> f = CasadiFunction(casadi.Function("f", [x, u], [casadi.vertcat(x[1], u[0])]))
+    >>> next_states, A, B = f.linearize(np.zeros((1, 2)), np.ones((1, 1)))
+    >>> A[0].tolist()
+    [[0.0, 1.0], [0.0, 0.0]]
+
+    See Also:
+        ``gpmpc.gp.casadi_.successor_function``, which makes one of a system.
     """
 
     def __init__(self, function: Any):

@@ -35,6 +35,9 @@ class DisturbedModel(LinearWrapper):
         ShapeError: E has another number of rows than the model has states.
         SettingError: A standard deviation is negative, a decay not between -1 and 1, or
             the model does not predict next states.
+
+    See Also:
+        ``gpmpc.estimation.KalmanFilter``, which estimates the disturbances.
     """
 
     model: DynamicsModel  #: without them, of n states

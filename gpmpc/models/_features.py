@@ -26,6 +26,17 @@ class Features:
     Raises:
         SettingError: An index is out of range or stands there twice, or an angle is not
             selected.
+
+    >>> import torch
+    >>> angle_and_rate = Features(
+    ...     states=[0, 1], inputs=[0], angles=[0], state_dim=2, input_dim=1
+    ... )
+    >>> state, _ = angle_and_rate(torch.tensor([0.0, 3.0]), torch.tensor([0.5]))
+    >>> state.tolist()
+    [0.0, 1.0, 3.0]
+
+    See Also:
+        ``ResidualModel``, whose GP sees them.
     """
 
     states: Sequence[int]  #: selected states, in the order of the features

@@ -119,6 +119,9 @@ class RigidBodyKinematics:
         v+ = v + (R f + g) dt,  p+ = p + v dt + (R f + g) dt^2 / 2
 
     with R the attitude in the middle of the step.
+
+    See Also:
+        ``LogModel``, which moves its states by them.
     """
 
     space: StateSpace

@@ -25,6 +25,11 @@ class Lags:
 
     Raises:
         SettingError: One of the numbers is no whole number of zero or more.
+
+    >>> lags = Lags(state_dim=2, input_dim=1, states=2, inputs=1)
+
+    See Also:
+        ``gpmpc.logs.learn``, which chooses them for a log.
     """
 
     state_dim: int  #: n, of what is measured

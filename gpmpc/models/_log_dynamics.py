@@ -45,6 +45,9 @@ class LogDynamics:
 
     Raises:
         SettingError: It has a term of the controller that flew.
+
+    See Also:
+        ``LogModel``; ``gpmpc.logs.IdentifiedModel``, which makes one.
     """
 
     model: LogModel  #: without context

@@ -78,6 +78,10 @@ class LogModel:
     Raises:
         SettingError: ``history`` has another number of outputs, or there is one beside
             a memory, whose means of outputs take its place.
+
+    See Also:
+        ``gpmpc.logs.learn``, which identifies one; ``LogDynamics``, which flies
+        one.
     """
 
     kinematics: Kinematics  #: how the outputs move a state

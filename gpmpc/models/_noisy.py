@@ -41,6 +41,9 @@ class NoisyModel(Wrapper):
         SettingError: ``outputs`` are no distinct outputs of the model, which predicts
             next states, or type or device of the GPs are others.
         ShapeError: The GPs have other states, inputs or outputs.
+
+    See Also:
+        ``gpmpc.estimation.estimate_varying_noise``, which learns one.
     """
 
     model: DynamicsModel  #: f, of n states and m inputs

@@ -30,6 +30,15 @@ class Affine:
     Raises:
         ShapeError: The shapes do not belong together.
         SettingError: One of the three is no tensor.
+
+    >>> import torch
+    >>> double = Affine(torch.eye(2), B=torch.ones(2, 1), c=torch.zeros(2))
+    >>> double(torch.tensor([1.0, 2.0]), torch.tensor([0.5])).tolist()
+    [1.5, 2.5]
+
+    See Also:
+        ``KnownModel`` for any function; ``ResidualModel``, which learns what it
+        misses.
     """
 
     A: Tensor  #: (n, n)
@@ -82,7 +91,17 @@ class Affine:
 
 @dataclass(frozen=True)
 class KnownModel:
-    """A known function x+ = f0(x, u) as a model without uncertainty."""
+    """A known function x+ = f0(x, u) as a model without uncertainty.
+
+    >>> import torch
+    >>> model = KnownModel(lambda x, u: 0.9 * x + u, state_dim=1, input_dim=1)
+    >>> state, input = torch.ones(1).double(), torch.zeros(1).double()
+    >>> model.predict(state, input).mean.tolist()
+    [0.9]
+
+    See Also:
+        ``Affine`` and ``CasadiFunction`` for functions; ``ResidualModel``.
+    """
 
     #: f0, from x (*batch, n) and u (*batch, m) to (*batch, n), such as
     #: ``CasadiFunction``

@@ -55,6 +55,9 @@ class MultirotorNominal:
 
     Raises:
         SettingError: There is no motor.
+
+    See Also:
+        ``gpmpc.logs.fit_nominal``, which fits its parameters.
     """
 
     motors: int  #: number of inputs, all of them motor signals

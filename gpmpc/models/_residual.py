@@ -64,6 +64,20 @@ class ResidualModel(TensorModel):
         ShapeError: The parts do not belong together.
         SettingError: The residual predicts something else, an index is out of range, or
             the noise is missing.
+
+    >>> from gpmpc.datasets import RandomData
+    >>> from gpmpc.gp import Trainer
+    >>> from gpmpc.models import Affine
+    >>> from gpmpc.systems import pendulum
+    >>> data = RandomData(samples=30).transitions(pendulum())
+    >>> model = ResidualModel.train(
+    ...     Affine.identity(2, 1), data, angles=[0], trainer=Trainer(restarts=0)
+    ... )
+    >>> model.features.dim, model.residual.output_dim
+    (3, 2)
+
+    See Also:
+        ``train``, which takes nominal model, angles and rates from a system.
     """
 
     #: f0, from x (*batch, n) and u (*batch, m) to (*batch, n), in torch; an ``Affine``

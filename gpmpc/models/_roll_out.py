@@ -50,6 +50,9 @@ class RollOut:
     A model whose ``affine_form`` or ``tape`` is not None takes one compiled call. Any
     other takes one call for each stage: of its ``predict_mean`` where it has that
     method, else of ``linearize``.
+
+    See Also:
+        ``gpmpc.propagation.rollout``, which carries a belief along.
     """
 
     def __init__(self, model: DynamicsModel):

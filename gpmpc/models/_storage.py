@@ -74,6 +74,10 @@ def save_model(
             JSON.
         DataError: The folder does not exist, or the model is too large to be read
             again.
+
+    See Also:
+        ``load_model``, which reads the file; ``gpmpc.gp.save_posterior`` for a
+        GP alone.
     """
     path = new_file(path)
     header, tensors = _model_parts(path, model)
@@ -96,6 +100,9 @@ def load_model(path: str | Path, trusted: Sequence[str] = ()) -> Any:
             or names code that is not there or not trusted.
         SettingError: ``trusted`` is no list of names of packages, or no controller can
             plan with a model of a log.
+
+    See Also:
+        ``save_model``, which writes the file.
     """
     packages = trusted_packages("trusted", trusted)
     path = existing_file(path, "a saved model")

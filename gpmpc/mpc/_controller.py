@@ -53,7 +53,8 @@ class Reference:
     (11, 2)
 
     See Also:
-        ``System.reference_states``, which makes the states along a trajectory.
+        ``gpmpc.systems.System.reference_states``, which makes the states along a
+        trajectory.
     """
 
     #: r_0 .. r_H (H + 1, n); r_0 belongs to the current time. Or a set point (n,), for
@@ -159,7 +160,14 @@ def read_reference(value: Any) -> Reference:
 
 @dataclass(frozen=True)
 class Timing:
-    """Wall time of the parts of a decision [s]."""
+    """Wall time of the parts of a decision [s].
+
+    >>> Timing(model=2e-4, build=1e-5, solve=1e-5).model
+    0.0002
+
+    See Also:
+        ``Decision``, which has one.
+    """
 
     model: float = 0.0  # propagation and linearisation
     build: float = 0.0  # from the local model to the optimisation problem
@@ -173,7 +181,12 @@ class Timing:
 
 @dataclass(frozen=True)
 class Decision:
-    """The input that a controller decided on at one step, with its plan."""
+    """The input that a controller decided on at one step, with its plan.
+
+    See Also:
+        ``GPMPC.control``, which returns it; ``gpmpc.status.Status`` for what
+        its status means.
+    """
 
     input: Array  #: to apply now (m,)
     inputs: Array  #: planned (H, m); the first row is ``input``
@@ -279,7 +292,12 @@ def model_of(controller: Any) -> Any:
 
 
 class Controller(Protocol):
-    """A feedback law with a look-ahead."""
+    """A feedback law with a look-ahead.
+
+    See Also:
+        ``GPMPC`` for the package's own; ``gpmpc.simulation.closed_loop``, which
+        flies one.
+    """
 
     @property
     def horizon(self) -> int:
@@ -300,7 +318,11 @@ class Controller(Protocol):
 
 
 class Request(NamedTuple):
-    """The arguments of ``control``, validated, as contiguous float64 arrays."""
+    """The arguments of ``control``, validated, as contiguous float64 arrays.
+
+    See Also:
+        ``Controller``, whose arguments it holds.
+    """
 
     state: Array  # mean of the belief (n,)
     covariance: Array  # of the belief (n, n)

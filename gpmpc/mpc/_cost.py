@@ -162,7 +162,7 @@ class LeastSquares:
     [[1.0]]
 
     See Also:
-        ``Tracking`` for the states themselves; ``Problem``, whose ``outputs`` they are.
+        ``Tracking`` for the states themselves; ``Problem``, which takes it.
     """
 
     #: a function of tensors, states (H, n), inputs (H, m) and, where the controller is

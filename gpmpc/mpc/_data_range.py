@@ -22,7 +22,11 @@ _SMALL = 0.1  # share of the data's range, or of a lengthscale, that counts for 
 
 
 class BeyondData(NamedTuple):
-    """A state whose reference leaves the range of the data."""
+    """A state whose reference leaves the range of the data.
+
+    See Also:
+        ``beyond_data``, which finds them.
+    """
 
     name: str
     reference: tuple[float, float]  #: its smallest and largest value
@@ -64,6 +68,10 @@ def beyond_data(model: DynamicsModel, reference: Any) -> list[BeyondData]:
         model: What was learned; models around it are looked through.
         reference: A set point (n,), or states of any number of steps (K, n), as for a
             controller.
+
+    See Also:
+        ``BeyondData``; ``gpmpc.datasets.RandomData`` for data that reach
+        farther.
     """
     signals = signals_of(model)
     states = np.atleast_2d(read_reference(reference).in_order(signals).states)

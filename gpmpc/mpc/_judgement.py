@@ -45,7 +45,14 @@ _FLOAT64 = np.dtype(np.float64)
 
 
 class Judgement(NamedTuple):
-    """What a step says of its flight."""
+    """What a step says of its flight.
+
+    >>> Judgement().level
+    'healthy'
+
+    See Also:
+        ``FlightJudge``, which makes it.
+    """
 
     level: Level = "healthy"
     reason: str = ""  #: in words; empty where it is healthy
@@ -58,6 +65,12 @@ class FlightJudgement(NamedTuple):
     """What all steps say of their flight.
 
     It is lost if one of them says so, else what the last one says.
+
+    >>> FlightJudgement().level
+    'healthy'
+
+    See Also:
+        ``FlightJudge``, which makes it.
     """
 
     level: Level = "healthy"
@@ -103,6 +116,9 @@ class FlightJudge:
 
     Attributes:
         last: Judgement of the last step.
+
+    See Also:
+        ``FlightJudgement``, its result; ``Judgement``, that of a step.
     """
 
     def __init__(

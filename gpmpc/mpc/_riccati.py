@@ -178,6 +178,14 @@ def dlqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
 
     Raises:
         SettingError: The inputs do not reach a mode that grows.
+
+    >>> import numpy as np
+    >>> gain = dlqr(np.array([[1.0]]), np.array([[1.0]]), np.eye(1), np.eye(1))
+    >>> gain.round(3).tolist()
+    [[0.618]]
+
+    See Also:
+        ``Stability``, which says what a loop does near its rest.
     """
     A, B, Q, R = (np.ascontiguousarray(matrix, dtype=float) for matrix in (A, B, Q, R))
     gains, _ = finite_horizon_lqr(A[None], B[None], Q[None], R[None], Q, _LONGEST)

@@ -49,7 +49,11 @@ _PLANT_GAINS = (0.7, 1.0, 1.3)  # that an estimate of the disturbance is to bear
 
 @dataclass(frozen=True)
 class Stability:
-    """What the loop does near the points where it is to rest."""
+    """What the loop does near the points where it is to rest.
+
+    See Also:
+        ``GPMPC.stability``, which computes it.
+    """
 
     horizon: int  #: H, of the controller
     #: the largest size of an eigenvalue of the closed loop: above 1 it does not settle;

@@ -116,6 +116,15 @@ def kicks(
         horizon: H.
         initial_input: Where all inputs begin and end (m,).
         share: How far a push goes, of the way from the initial input to its bounds.
+
+    >>> from gpmpc.mpc import Box, Problem, Tracking
+    >>> problem = Problem(Tracking([1.0], [1.0]), inputs=Box([-2.0], [2.0]))
+    >>> guesses = kicks(problem, horizon=4, initial_input=[0.0])
+    >>> guesses[0].shape
+    (4, 1)
+
+    See Also:
+        ``ManyStarts``, which searches from them.
     """
     drift = np.tile(np.asarray(initial_input, dtype=float), (horizon, 1))
     length = max(1, horizon // 6)

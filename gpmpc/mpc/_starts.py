@@ -265,6 +265,18 @@ class ManyStarts:
     Raises:
         SettingError: A controller of another form, or a number out of range.
         ShapeError: Guesses of another shape.
+
+    >>> from gpmpc.models import KnownModel
+    >>> from gpmpc.mpc import GPMPC, Box, Problem, Tracking
+    >>> from gpmpc.propagation import Linearization
+    >>> problem = Problem(Tracking([1.0], [1.0]), inputs=Box([-2.0], [2.0]))
+    >>> model = KnownModel(lambda x, u: 0.9 * x + u, state_dim=1, input_dim=1)
+    >>> single = GPMPC(model, Linearization(), problem, 5, [0.0])
+    >>> ManyStarts(single).horizon
+    5
+
+    See Also:
+        ``kicks``, the guesses of inputs that it begins from by default.
     """
 
     def __init__(

@@ -159,8 +159,8 @@ class GPMPC:
 
     See Also:
         ``ControlLoop`` for a loop of your own, ``gpmpc.simulation.closed_loop`` for a
-        simulated one; ``ManyStarts`` where a plan may end in the wrong valley; ``NMPC``
-        of ``gpmpc.mpc.baselines`` on the true model.
+        simulated one; ``ManyStarts`` where a plan may end in the wrong valley;
+        ``gpmpc.mpc.baselines.NMPC`` on the true model.
     """
 
     def __init__(
@@ -408,6 +408,10 @@ class NonlinearGPMPC(GPMPC):
 
     Its programs hold the whole belief: it is ``GPMPC`` of another covariance mode and
     more iterations; arguments as there.
+
+    See Also:
+        ``GPMPC``, which it makes; ``gpmpc.mpc.baselines.NMPC`` with a known
+        model.
     """
 
     def __init__(

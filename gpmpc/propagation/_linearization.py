@@ -149,6 +149,12 @@ class MeanEquivalence(NoisyPropagator):
     """The prediction at the belief's mean, without the uncertainty of the state.
 
     State and next state come out uncorrelated.
+
+    >>> MeanEquivalence().process_noise
+    True
+
+    See Also:
+        ``Linearization``, which carries the state's uncertainty along.
     """
 
     def differentiate(

@@ -62,6 +62,9 @@ def linearize(
     Along a plan both have a leading dimension H. A local model is a constant: no
     gradient flows through it, and torch's function transforms do not apply. Arguments
     are those of ``differentiate``.
+
+    See Also:
+        ``gpmpc.models.linearize``, at points; ``differentiate``.
     """
     belief = Gaussian(belief.mean.detach(), belief.covariance.detach())
     input = belief.mean[..., :0] if input is None else input.detach()
@@ -185,6 +188,19 @@ def rollout(
 
     Raises:
         ShapeError: The inputs have no step.
+
+    >>> import torch
+    >>> from gpmpc.gaussian import Gaussian
+    >>> from gpmpc.models import KnownModel
+    >>> from gpmpc.propagation import Linearization
+    >>> model = KnownModel(lambda x, u: x + u, state_dim=1, input_dim=1)
+    >>> belief = Gaussian(torch.zeros(1).double(), torch.eye(1).double())
+    >>> beliefs = rollout(Linearization(), model, belief, torch.ones(3, 1).double())
+    >>> beliefs.mean.flatten().tolist()
+    [1.0, 2.0, 3.0]
+
+    See Also:
+        ``gpmpc.calibration.calibrate``, which compares such beliefs with a log.
     """
     check_tensors(inputs=inputs)
     if inputs.dim() < 2 or not inputs.shape[-2]:

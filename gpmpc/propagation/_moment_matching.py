@@ -153,7 +153,16 @@ class MomentMatching(NoisyPropagator):
 
 
 def best_propagator(model: Any) -> Propagator:
-    """Makes ``MomentMatching()`` if a model has exact moments, else ``Unscented()``."""
+    """Makes ``MomentMatching()`` if a model has exact moments, else ``Unscented()``.
+
+    >>> from gpmpc.models import KnownModel
+    >>> model = KnownModel(lambda x, u: x, state_dim=1, input_dim=0)
+    >>> type(best_propagator(model)).__name__
+    'Unscented'
+
+    See Also:
+        ``MomentMatching``; ``Unscented``; ``Linearization``, the fastest.
+    """
     return MomentMatching() if _has_exact_moments(model) else Unscented()
 
 

@@ -80,6 +80,17 @@ class Unscented(NoisyPropagator):
 
     Raises:
         SettingError: alpha is not positive, or (at the first step) n + kappa is not.
+
+    >>> import torch
+    >>> from gpmpc.gaussian import Gaussian
+    >>> from gpmpc.models import KnownModel
+    >>> model = KnownModel(lambda x, u: x**2, state_dim=1, input_dim=0)
+    >>> belief = Gaussian(torch.zeros(1).double(), torch.eye(1).double())
+    >>> Unscented()(model, belief).mean.tolist()
+    [1.0]
+
+    See Also:
+        ``MomentMatching``, which is exact for GPs; ``MonteCarlo``.
     """
 
     def __init__(
@@ -250,6 +261,18 @@ class MonteCarlo(NoisyPropagator):
 
     Raises:
         SettingError: Fewer than two samples, or a seed that is no whole number.
+
+    >>> import torch
+    >>> from gpmpc.gaussian import Gaussian
+    >>> from gpmpc.models import KnownModel
+    >>> model = KnownModel(lambda x, u: 2.0 * x, state_dim=1, input_dim=0)
+    >>> belief = Gaussian(torch.zeros(1).double(), torch.eye(1).double())
+    >>> after = MonteCarlo(samples=4000)(model, belief)
+    >>> round(float(after.covariance), 1) in (3.9, 4.0, 4.1)
+    True
+
+    See Also:
+        ``MomentMatching``, which is exact for GPs; ``Unscented``.
     """
 
     def __init__(

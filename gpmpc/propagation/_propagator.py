@@ -20,7 +20,11 @@ from gpmpc.signals import Signals, signals_of
 
 @dataclass(frozen=True)
 class Propagation:
-    """A belief after one step."""
+    """A belief after one step.
+
+    See Also:
+        ``Propagator``, which returns it.
+    """
 
     #: N(mean, covariance) of the next state; symmetric positive semidefinite covariance
     belief: Gaussian
@@ -38,6 +42,9 @@ class Sensitivity:
     There are k outputs, mostly k = n. Derivatives by Sigma are symmetric in their last
     two indices: d mu+_a = sum_cd mean_by_covariance[a, c, d] dSigma[c, d] for symmetric
     dSigma.
+
+    See Also:
+        ``differentiate``, which returns it.
     """
 
     mean_by_mean: Tensor  #: (*batch, k, n)
@@ -70,6 +77,10 @@ class Propagator(Protocol):
     ``diagonal``: it computes only the diagonal of the predicted covariance.
     ``process_noise``: it adds the model's noise covariance to the predicted one;
     controllers that predict covariances by themselves then add it too.
+
+    See Also:
+        ``gpmpc.testing.check_propagator``, which tells what one of one's own
+        lacks; ``Linearization``.
     """
 
     def propagate(
@@ -159,6 +170,19 @@ def differentiate(
         What ``propagator.propagate`` returns, and the derivatives. Where the covariance
         had to be projected they are those of the projection (autograd) or of the matrix
         that was projected (closed form).
+
+    >>> import torch
+    >>> from gpmpc.gaussian import Gaussian
+    >>> from gpmpc.models import KnownModel
+    >>> from gpmpc.propagation import Unscented
+    >>> model = KnownModel(lambda x, u: 3.0 * x, state_dim=1, input_dim=0)
+    >>> belief = Gaussian(torch.zeros(1).double(), torch.eye(1).double())
+    >>> _, slopes = differentiate(Unscented(), model, belief)
+    >>> slopes.mean_by_mean.round(decimals=6).tolist()
+    [[3.0]]
+
+    See Also:
+        ``linearize``, for plans; ``rollout``.
     """
     closed_form = getattr(propagator, "differentiate", None)
     if closed_form is not None:

@@ -49,6 +49,9 @@ class Cascade:
 
     Raises:
         SettingError: A ratio below 1, or a response time that is not positive.
+
+    See Also:
+        ``cascade_loop``, which flies it.
     """
 
     #: on states x, vx, y, vy, z, vz [m, m/s] and inputs U1 [N], ux, uy [-]
@@ -131,6 +134,9 @@ def cascade_loop(
         ShapeError: The plant has other states, or references are too few.
         SolverFailure: Its step is that of the controller that failed.
         Diverged: Its step is an inner one.
+
+    See Also:
+        ``Cascade``; ``closed_loop`` for one controller.
     """
     names = (plant.state_names, plant.input_names)
     if names != (Coupled.state_names, Coupled.input_names):

@@ -20,7 +20,11 @@ from gpmpc.systems import System
 
 
 class Disturbance(Protocol):
-    """Something that a controller does not know of."""
+    """Something that a controller does not know of.
+
+    See Also:
+        ``Gust``, ``Dropout`` and ``Replaced``, which are some.
+    """
 
     def disturb_plant(self, plant: System, time: float) -> System:
         """Returns the plant that acts in the place of another, from a time [s] on.
@@ -98,7 +102,15 @@ class Gust(_Window):
 @explains_arguments
 @dataclass(frozen=True)
 class Replaced(_Window):
-    """Another plant over a time window: another mass, a broken arm."""
+    """Another plant over a time window: another mass, a broken arm.
+
+    >>> from gpmpc.systems import pendulum
+    >>> heavier = Replaced(pendulum(mass=1.5), start=2.0)
+
+    See Also:
+        ``Gust`` and ``Dropout``; ``closed_loop(..., disturbances=[...])`` takes
+        them.
+    """
 
     plant: System  #: what acts then
     start: float = 0.0  #: when it begins [s]
@@ -121,7 +133,15 @@ class Replaced(_Window):
 @explains_arguments
 @dataclass(frozen=True)
 class Dropout(_Window):
-    """Nothing is measured over a time window: entries of the state are NaN."""
+    """Nothing is measured over a time window: entries of the state are NaN.
+
+    >>> Dropout(start=1.0, stop=1.5, entries=[0]).entries
+    (0,)
+
+    See Also:
+        ``Gust`` and ``Replaced``; ``closed_loop(..., disturbances=[...])``
+        takes them.
+    """
 
     start: float  #: when it begins [s]
     stop: float  #: when it ends [s]

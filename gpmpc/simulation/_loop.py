@@ -113,7 +113,11 @@ def closed_loop(
 
 @dataclass(frozen=True)
 class Trial:
-    """The result of one seed."""
+    """The result of one seed.
+
+    See Also:
+        ``closed_loops``, which returns one a seed.
+    """
 
     seed: int
     result: Rollout | None  # None where it failed
@@ -199,6 +203,9 @@ def rehearse(
     A flight's times then hold no compiling and loading. There are two, since the second
     one starts from a plan. What fails here fails again in the flight, and is raised
     there.
+
+    See Also:
+        ``closed_loop``; ``gpmpc.mpc.ControlLoop.warm_up``, without a plant.
     """
     with suppress(GpmpcError):
         closed_loop(

@@ -12,7 +12,12 @@ Array = np.ndarray
 
 @dataclass(frozen=True)
 class Rollout:
-    """K steps of a closed loop, n states and m inputs."""
+    """K steps of a closed loop, n states and m inputs.
+
+    See Also:
+        ``closed_loop``, which returns it; ``gpmpc.plotting.flight_figure``,
+        which draws it.
+    """
 
     states: Array  # (K + 1, n) x[0] .. x[K], or the means of the beliefs
     covariances: Array  # (K + 1, n, n) of the beliefs; zero with a plant in the loop

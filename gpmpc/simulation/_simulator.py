@@ -43,6 +43,9 @@ class ModelLoop:
 
     Raises:
         SettingError: A time step that is not positive.
+
+    See Also:
+        ``closed_loop``, which takes one in the place of a system.
     """
 
     model: DynamicsModel  #: it predicts the next state

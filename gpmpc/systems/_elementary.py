@@ -13,72 +13,132 @@ from gpmpc.exceptions import check_number
 
 
 def sin(angle: Any) -> Any:
-    """Returns the sine of an angle [rad]."""
+    """Returns the sine of an angle [rad].
+
+    >>> float(sin(0.0))
+    0.0
+
+    See Also:
+        numpy's functions of the same names, which plain dynamics may use as
+        well.
+    """
     return _unary("sin", angle)
 
 
 def cos(angle: Any) -> Any:
-    """Returns the cosine of an angle [rad]."""
+    """Returns the cosine of an angle [rad].
+
+    >>> float(cos(0.0))
+    1.0
+    """
     return _unary("cos", angle)
 
 
 def tan(angle: Any) -> Any:
-    """Returns the tangent of an angle [rad]."""
+    """Returns the tangent of an angle [rad].
+
+    >>> float(tan(0.0))
+    0.0
+    """
     return _unary("tan", angle)
 
 
 def asin(value: Any) -> Any:
-    """Returns the angle [rad] in [-pi/2, pi/2] of a sine."""
+    """Returns the angle [rad] in [-pi/2, pi/2] of a sine.
+
+    >>> float(asin(0.0))
+    0.0
+    """
     return _unary("arcsin", value)
 
 
 def acos(value: Any) -> Any:
-    """Returns the angle [rad] in [0, pi] of a cosine."""
+    """Returns the angle [rad] in [0, pi] of a cosine.
+
+    >>> float(acos(1.0))
+    0.0
+    """
     return _unary("arccos", value)
 
 
 def atan(value: Any) -> Any:
-    """Returns the angle [rad] in [-pi/2, pi/2] of a tangent."""
+    """Returns the angle [rad] in [-pi/2, pi/2] of a tangent.
+
+    >>> float(atan(0.0))
+    0.0
+    """
     return _unary("arctan", value)
 
 
 def atan2(y: Any, x: Any) -> Any:
-    """Returns the angle [rad] in [-pi, pi] of the direction (x, y)."""
+    """Returns the angle [rad] in [-pi, pi] of the direction (x, y).
+
+    >>> float(atan2(0.0, 1.0))
+    0.0
+    """
     return _binary("arctan2", y, x)
 
 
 def exp(value: Any) -> Any:
-    """Returns e to the power of a value."""
+    """Returns e to the power of a value.
+
+    >>> float(exp(0.0))
+    1.0
+    """
     return _unary("exp", value)
 
 
 def log(value: Any) -> Any:
-    """Returns the natural logarithm of a positive value."""
+    """Returns the natural logarithm of a positive value.
+
+    >>> float(log(1.0))
+    0.0
+    """
     return _unary("log", value)
 
 
 def sqrt(value: Any) -> Any:
-    """Returns the square root of a value; its slope is infinite at zero."""
+    """Returns the square root of a value; its slope is infinite at zero.
+
+    >>> float(sqrt(4.0))
+    2.0
+    """
     return _unary("sqrt", value)
 
 
 def sinh(value: Any) -> Any:
-    """Returns the hyperbolic sine of a value."""
+    """Returns the hyperbolic sine of a value.
+
+    >>> float(sinh(0.0))
+    0.0
+    """
     return _unary("sinh", value)
 
 
 def cosh(value: Any) -> Any:
-    """Returns the hyperbolic cosine of a value."""
+    """Returns the hyperbolic cosine of a value.
+
+    >>> float(cosh(0.0))
+    1.0
+    """
     return _unary("cosh", value)
 
 
 def tanh(value: Any) -> Any:
-    """Returns the hyperbolic tangent of a value."""
+    """Returns the hyperbolic tangent of a value.
+
+    >>> float(tanh(0.0))
+    0.0
+    """
     return _unary("tanh", value)
 
 
 def abs(value: Any) -> Any:
-    """Returns the magnitude of a value; its slope is zero at zero."""
+    """Returns the magnitude of a value; its slope is zero at zero.
+
+    >>> abs(-2.0)
+    2.0
+    """
     return builtins.abs(value)
 
 
@@ -100,12 +160,20 @@ def sign(value: Any, width: float) -> Any:
 
 
 def min(first: Any, second: Any) -> Any:
-    """Returns the smaller of two values, element by element."""
+    """Returns the smaller of two values, element by element.
+
+    >>> float(min(1.0, 2.0))
+    1.0
+    """
     return _binary("minimum", first, second)
 
 
 def max(first: Any, second: Any) -> Any:
-    """Returns the larger of two values, element by element."""
+    """Returns the larger of two values, element by element.
+
+    >>> float(max(1.0, 2.0))
+    2.0
+    """
     return _binary("maximum", first, second)
 
 
@@ -114,6 +182,12 @@ def where(condition: Any, value: Any, otherwise: Any) -> Any:
 
     Both are computed. It takes the place of ``if``, which a condition of arrays or
     CasADi expressions cannot decide.
+
+    >>> float(where(True, 1.0, 2.0))
+    1.0
+
+    See Also:
+        ``sign``, which is smooth.
     """
     package = _package_of(condition, value, otherwise)
     if package == "casadi":

@@ -46,6 +46,9 @@ class Translational:
     """Position and velocity, driven by thrust and thrust direction.
 
     States x, vx, y, vy, z, vz [m, m/s]; inputs U1 [N], ux, uy [-].
+
+    See Also:
+        ``translational``, which makes a system of it.
     """
 
     mass: float = 0.74  #: [kg]
@@ -94,6 +97,9 @@ class Rotational:
     """Attitude and body rates, driven by the moments' forces.
 
     States phi, p, theta, q, psi, r [rad, rad/s]; inputs U2, U3, U4 [N].
+
+    See Also:
+        ``rotational``, which makes a system of it.
     """
 
     arm: float = 0.21  #: distance l from the centre of mass to a rotor [m]
@@ -137,6 +143,9 @@ class Coupled:
 
     States x, vx, y, vy, z, vz [m, m/s], phi, p, theta, q, psi, r [rad, rad/s]; inputs
     U1, U2, U3, U4 [N].
+
+    See Also:
+        ``coupled``, which makes a system of it.
     """
 
     #: of the vehicle [kg]
@@ -174,6 +183,9 @@ class Map:
     """Reads a right-hand side as the next state, x[k+1] = f(x[k], u[k]).
 
     The data of Cao, Lai and Alam (2017) do.
+
+    See Also:
+        ``System``, which takes it as dynamics.
     """
 
     dynamics: Any  #: the right-hand side f
@@ -193,6 +205,12 @@ def translational(
     """Makes the translational subsystem.
 
     One Runge-Kutta substep is exact: its acceleration follows from the input.
+
+    >>> translational().state_names
+    ('x', 'vx', 'y', 'vy', 'z', 'vz')
+
+    See Also:
+        ``rotational``, the other half; ``coupled``.
     """
     return System(
         Translational(**parameters),
@@ -215,6 +233,12 @@ def rotational(
     """Makes the rotational subsystem at 20 Hz.
 
     A trajectory prescribes the attitudes that a flight along it needs.
+
+    >>> len(rotational().state_names)
+    6
+
+    See Also:
+        ``translational``, the other half; ``coupled``.
     """
     return System(
         Rotational(**parameters),
@@ -240,6 +264,12 @@ def coupled(
     """Makes the whole quadrotor at the rate of its inner loop.
 
     Its mass is in kg, and ``parameters`` are those of ``Rotational``.
+
+    >>> len(coupled().state_names)
+    12
+
+    See Also:
+        ``translational`` and ``rotational``, its halves.
     """
     return System(
         Coupled(mass, Rotational(**parameters)),
@@ -281,6 +311,9 @@ def attitude_for_thrust_direction(
     asin(ux / cos(phi)). The authors' data hold theta = sign(phi) asin(ux) instead,
     which the convention ``"paper"`` takes in the place of ``"exact"``; any other is a
     ``SettingError``. ux and uy saturate at 1 and -1.
+
+    See Also:
+        ``rotational``, which follows such attitudes.
     """
     check_choice("attitude", convention, ATTITUDES)
     ux, uy = ux * np.cos(psi) + uy * np.sin(psi), uy * np.cos(psi) - ux * np.sin(psi)

@@ -52,7 +52,14 @@ class DoubleIntegrator(_Body):
 
 
 def double_integrator(time_step: float = 0.1, **parameters: float) -> System:
-    """Makes a mass on a line."""
+    """Makes a mass on a line.
+
+    >>> double_integrator(mass=2.0).state_names
+    ('position', 'velocity')
+
+    See Also:
+        ``System`` for one's own.
+    """
     return System(
         DoubleIntegrator(**parameters),
         time_step,
@@ -93,7 +100,14 @@ class Pendulum(_Body):
 
 
 def pendulum(time_step: float = 0.05, **parameters: float) -> System:
-    """Makes a pendulum that hangs at first."""
+    """Makes a pendulum that hangs at first.
+
+    >>> pendulum(mass=1.2).state_names
+    ('angle', 'rate')
+
+    See Also:
+        ``System`` for one's own; ``cart_pole``; ``acrobot``.
+    """
     return System(
         Pendulum(**parameters),
         time_step,
@@ -144,6 +158,12 @@ def cart_pole(time_step: float = 0.05, **parameters: float) -> System:
     """Makes a cart-pole whose pole hangs at first.
 
     Its angle is positive towards growing positions.
+
+    >>> cart_pole().angles
+    ('angle',)
+
+    See Also:
+        ``System`` for one's own; ``pendulum``.
     """
     return System(
         CartPole(**parameters),
@@ -234,6 +254,12 @@ def acrobot(
     """Makes an acrobot that hangs at first (Spong, 1995, and its table).
 
     ``torque`` is its largest [N m].
+
+    >>> acrobot(torque=8.0).input_upper
+    (8.0,)
+
+    See Also:
+        ``double_pendulum``, with the numbers of a real one.
     """
     links = DoublePendulum(
         masses, first_length, centres=(0.5, 1.0), inertias=(0.083, 0.33)
@@ -252,6 +278,12 @@ def double_pendulum(
     """Makes the double pendulum of the RealAIGym league, which hangs at first.
 
     ``torque`` is its largest [N m].
+
+    >>> double_pendulum().input_names
+    ('torque',)
+
+    See Also:
+        ``acrobot``.
     """
     links = DoublePendulum(actuated=actuated, **parameters)
     return _two_links(
@@ -318,7 +350,14 @@ class PlanarQuadrotor(_Body):
 
 
 def planar_quadrotor(time_step: float = 0.05, **parameters: float) -> System:
-    """Makes a planar quadrotor."""
+    """Makes a planar quadrotor.
+
+    >>> planar_quadrotor().input_names
+    ('right', 'left')
+
+    See Also:
+        ``translational`` and ``rotational``, of a whole quadrotor.
+    """
     vehicle = PlanarQuadrotor(**parameters)
     weight = vehicle.mass * GRAVITY
     return System(
@@ -390,6 +429,12 @@ def stirred_tank(time_step: float = 3.0, **parameters: float) -> System:
     """Makes the reactor, which starts at its stable point of low conversion.
 
     Its goal is the unstable point.
+
+    >>> stirred_tank().unit
+    'K'
+
+    See Also:
+        ``System`` for one's own.
     """
     return System(
         StirredTank(**parameters),

@@ -22,6 +22,9 @@ class KinematicBicycle:
 
     Source: Kong, Pfeiffer, Schildbach and Borrelli (2015), Kinematic and dynamic
     vehicle models for autonomous driving control design.
+
+    See Also:
+        ``kinematic_bicycle``, which makes a system of it.
     """
 
     curvature: float = 1.0  #: of the path, per tangent of the steering: 1 / wheelbase
@@ -60,6 +63,9 @@ class DynamicBicycle:
 
     Source: Rajamani (2012), Vehicle Dynamics and Control, chapter 2, with a tyre force
     F = C a / sqrt(1 + (C a / grip)^2) at a slip a, all divided by the mass.
+
+    See Also:
+        ``dynamic_bicycle``, which makes a system of it.
     """
 
     front_length: float = 0.15  #: from the centre of mass to the front axle [m]
@@ -111,6 +117,9 @@ class DifferentialDrive:
 
     The inputs are the speeds of both wheels, or a speed and a turn rate: how each moves
     and turns it are parameters.
+
+    See Also:
+        ``differential_drive``, which makes a system of it.
     """
 
     forward_by_first: float = 1.0  #: speed of a unit of the first input [m/s]
@@ -137,7 +146,11 @@ class DifferentialDrive:
 @explains_arguments
 @dataclass(frozen=True)
 class LaggedDifferentialDrive(DifferentialDrive):
-    """A robot on two wheels whose speed and turn rate follow what they are told."""
+    """A robot on two wheels whose speed and turn rate follow what they are told.
+
+    See Also:
+        ``DifferentialDrive``, without the lag.
+    """
 
     speed_decay: float = 3.0  #: one over the time constant of the speed [1/s]
     turn_decay: float = 3.0  #: of the turn rate [1/s]
@@ -157,7 +170,14 @@ class LaggedDifferentialDrive(DifferentialDrive):
 
 
 def kinematic_bicycle(time_step: float = 0.05, **parameters: float) -> System:
-    """Makes a car that rolls without slip."""
+    """Makes a car that rolls without slip.
+
+    >>> kinematic_bicycle().input_names
+    ('steering', 'drive')
+
+    See Also:
+        ``dynamic_bicycle``, whose tyres slip.
+    """
     return System(
         KinematicBicycle(**parameters),
         time_step,
@@ -181,7 +201,14 @@ def kinematic_bicycle(time_step: float = 0.05, **parameters: float) -> System:
 
 
 def dynamic_bicycle(time_step: float = 0.02, **parameters: float) -> System:
-    """Makes a car whose tyres slip, of a tenth of a car's size."""
+    """Makes a car whose tyres slip, of a tenth of a car's size.
+
+    >>> dynamic_bicycle().state_names
+    ('x', 'y', 'heading', 'forward_speed', 'lateral_speed', 'yaw_rate')
+
+    See Also:
+        ``kinematic_bicycle``, whose tyres do not slip.
+    """
     return System(
         DynamicBicycle(**parameters),
         time_step,
@@ -211,7 +238,14 @@ def dynamic_bicycle(time_step: float = 0.02, **parameters: float) -> System:
 
 
 def differential_drive(time_step: float = 0.1, **parameters: float) -> System:
-    """Makes a robot on two wheels, told its speed and its turn rate."""
+    """Makes a robot on two wheels, told its speed and its turn rate.
+
+    >>> differential_drive().angles
+    ('heading',)
+
+    See Also:
+        ``kinematic_bicycle``.
+    """
     return System(
         DifferentialDrive(**parameters),
         time_step,
