@@ -18,6 +18,7 @@ A new structure has one of these places:
   ``ParametricNominal`` in ``_parametric``, which ``gpmpc.logs`` fits and compares;
 - a model with a past, such as ARX: a state with earlier values in ``_lags``, or rows of
   ``Windows`` before the start, as ``LogModel.history`` and ``LogModel.lag`` read them;
+  loops keep what its state holds beside what is measured by ``_past``;
 - other movements of states by outputs: kinematics in ``_kinematics``;
 - further states that are linear: a ``LinearWrapper``.
 """

@@ -55,6 +55,9 @@ class LogDynamics:
     time_step: float  #: [s]
     noise: OutputNoise | None = None  #: of its outputs; none by default
     signals: Signals = UNKNOWN  #: names and time step, where they are known
+    #: smallest and largest measured states and inputs of the log (2, n + m), where they
+    #: are known
+    ranges: Array | None = None
     dtype = torch.float64
     device = torch.device("cpu")
 

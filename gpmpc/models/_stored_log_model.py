@@ -164,6 +164,7 @@ def read_log_dynamics(path: Path, trusted: Sequence[str] = ()) -> LogDynamics:
         time_step=named.time_step,
         noise=named.noise,
         signals=Signals(named.state_names, named.input_names, named.time_step),
+        ranges=tensors["ranges"].numpy() if "ranges" in tensors else None,
     )
 
 

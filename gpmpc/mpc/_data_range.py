@@ -12,13 +12,18 @@ from gpmpc._angles import TURN
 from gpmpc._dynamics import DynamicsModel, to_array
 from gpmpc.exceptions import ShapeError
 from gpmpc.gp import GPPosterior
-from gpmpc.models import ResidualModel
+from gpmpc.models import LogDynamics, ResidualModel, RigidBodyKinematics
+from gpmpc.models._past import measured_dim
 from gpmpc.mpc._controller import read_reference
 from gpmpc.signals import signals_of
 
 Array = np.ndarray
 
 _SMALL = 0.1  # share of the data's range, or of a lengthscale, that counts for nothing
+
+
+_MOTION_OF_A_BODY = range(7, 13)  # its velocity and its rate
+_ALL_AROUND = 0.75 * TURN  # of an angle
 
 
 class BeyondData(NamedTuple):
@@ -77,9 +82,10 @@ def beyond_data(model: DynamicsModel, reference: Any) -> list[BeyondData]:
     states = np.atleast_2d(read_reference(reference).in_order(signals).states)
     states = np.asarray(states, dtype=float)
     columns = _columns(model)
-    if columns and states.shape[-1] != model.state_dim:
+    sizes = (measured_dim(model), model.state_dim)
+    if columns and states.shape[-1] not in sizes:
         raise ShapeError(
-            f"reference must have {model.state_dim} states; got {states.shape[-1]}"
+            f"reference must have {sizes[0]} states; got {states.shape[-1]}"
         )
     beyond = []
     for column in columns:
@@ -106,10 +112,31 @@ def _columns(model: Any) -> list[_Column]:
     """Returns what the GPs of a model have seen, in the order of its states."""
     if isinstance(model, GPPosterior):
         return _columns_of(model, list(range(model.state_dim)), [])
+    if isinstance(model, LogDynamics):
+        return _columns_of_log(model)
     if isinstance(model, ResidualModel):
         return _columns_of(model.residual, list(model.states), list(model.angles))
     within = getattr(model, "model", None)
     return [] if within is None else _columns(within)
+
+
+def _columns_of_log(model: LogDynamics) -> list[_Column]:
+    """Returns the columns of a log, but those that its model does not depend on.
+
+    Of an angle that was everywhere nothing is beyond.
+    """
+    if model.ranges is None:
+        return []
+    states = list(range(model.measured_dim))
+    if isinstance(model.model.kinematics, RigidBodyKinematics):
+        states = list(_MOTION_OF_A_BODY)
+    columns = []
+    for i in states:
+        low, high = (float(limit) for limit in model.ranges[:, i])
+        is_angle = i in model.angles
+        if not (is_angle and high - low > _ALL_AROUND):
+            columns.append(_Column(i, low, high, lengthscale=0.0, angle=is_angle))
+    return columns
 
 
 def _columns_of(gp: GPPosterior, states: list[int], angles: list[int]) -> list[_Column]:

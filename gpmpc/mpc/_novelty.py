@@ -22,7 +22,8 @@ from gpmpc._compiled import compiled
 from gpmpc._dynamics import Array, DynamicsModel, linearize, to_array
 from gpmpc.gp import GPPosterior
 from gpmpc.gp._posterior import AffineForm
-from gpmpc.models import DelayedModel, DisturbedModel, ResidualModel
+from gpmpc.models import DelayedModel, DisturbedModel, LogDynamics, ResidualModel
+from gpmpc.models._kinematics import Increments
 
 _ROWS = 16  # of a kernel matrix that tell observations from pseudo-observations
 
@@ -38,13 +39,15 @@ class DataScales(NamedTuple):
 def data_scales(model: DynamicsModel) -> DataScales | None:
     """Returns the scales of a model's data; None where they are not known.
 
-    They are for GPs, for a residual with a constant B, and for both with delays or
-    disturbances.
+    They are for GPs, a residual with a constant B, the GPs of a log, and for all of
+    them with delays or disturbances.
     """
     n = model.state_dim
     if isinstance(model, DelayedModel | DisturbedModel):
         inner = data_scales(model.model)
         return None if inner is None else _with_further_states(inner, n)
+    if isinstance(model, LogDynamics):
+        return _log_scales(model)
     form = _learned_part(model)
     if form is None:
         return None
@@ -52,6 +55,29 @@ def data_scales(model: DynamicsModel) -> DataScales | None:
     return DataScales(
         variances=B**2 @ _learned_variances(form.f), ranges=_ranges(form, n)
     )
+
+
+def _log_scales(model: LogDynamics) -> DataScales | None:
+    """Returns the scales of the data of a log's model; None where they are not known.
+
+    They are for GPs on rates of change.
+    """
+    gps = model.model.gps
+    if not isinstance(model.model.kinematics, Increments):
+        return None
+    if not gps or model.ranges is None:
+        return None
+    n = model.measured_dim
+    if len(model.model.history) != n:  # a quaternion has one rate less than entries
+        return None
+    outputs = np.zeros(n)
+    for gp in gps:
+        outputs[list(gp.outputs)] += _learned_variances(gp.posterior)
+    ranges = np.ptp(model.ranges[:, :n], axis=0)
+    ranges[list(model.angles)] = np.pi
+    ranges = np.where(ranges > 0.0, ranges, np.inf)
+    scales = DataScales(variances=model.time_step**2 * outputs, ranges=ranges)
+    return _with_further_states(scales, model.state_dim)
 
 
 def _with_further_states(scales: DataScales, n: int) -> DataScales:

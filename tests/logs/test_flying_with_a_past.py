@@ -1,5 +1,7 @@
 """Loops keep what the state of a model holds beside what is measured."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -21,6 +23,7 @@ from gpmpc.mpc import (
     ManyStarts,
     Problem,
     Tracking,
+    beyond_data,
 )
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Dropout, ModelLoop, closed_loop, closed_loops
@@ -212,6 +215,14 @@ def test_a_delay_is_kept_like_any_other_past():
     together = trials[2].result
     assert together is not None
     np.testing.assert_allclose(together.states, alone.states, atol=1e-12)
+
+
+def test_a_reference_beyond_the_log_is_named():
+    ranges = np.array([[-2.0, -0.2, -3.0], [2.0, 0.2, 3.0]])
+    model = replace(dynamics(), ranges=ranges)
+    assert beyond_data(model, GOAL) == []
+    (beyond,) = beyond_data(DelayedModel(model, 1), [1.0, 0.5])
+    assert beyond.data == (-0.2, 0.2)
 
 
 def test_models_of_logs_are_compared_by_identity():
