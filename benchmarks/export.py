@@ -1,21 +1,23 @@
 """Holds exported controllers to the decisions of Python, question by question.
 
-    .venv/bin/python -m benchmarks.export [--questions 100000] [--cases quadrotor-10 ..]
+    .venv/bin/python -m benchmarks.export [--questions 20000] [--cases quadrotor-10 ..]
                                           [--precisions double float]
 
 Six controllers fly in closed loops of Python: the quadrotor of the paper with a
 horizon of 10 and of 20 (chance constraints of its position), a learned cart-pole that
 must keep to its rail, the MuJoCo quadrotor whose residual is learned on a rigid body,
 the learned pole whose input acts three steps late, and the stirred tank. Every question
-of these flights (belief, reference, last decision) goes to the compiled C as well.
+of these flights (belief, reference, last decision) goes to the compiled C as well, in
+double and in float. Every flight has a seed, of its noise and of what disturbs its
+start, its reference or its wind.
 Printed for each: questions, the largest difference of an input, as a share of the
-input's range in brackets, other statuses, and the median time of both [ms]. Writes
-``outputs/benchmarks/export.json``.
+input's range in brackets, other statuses, and the median time of a step of Python and
+of C alone [ms]. Writes ``outputs/benchmarks/export.json``.
 """
 
 import argparse
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -56,27 +58,27 @@ class Case(NamedTuple):
 
 
 class Comparison:
-    """A controller that lets the compiled one answer every question, too.
+    """A controller that lets compiled ones answer every question, too.
 
     Attributes:
-        differences: Of the inputs (questions, m).
-        other_statuses: Pairs of names, where they differ.
-        statuses: How often Python's decisions had each.
         inputs: Python's (questions, m).
-        seconds: Of both (questions, 2).
+        statuses: How often Python's decisions had each.
+        python_seconds: Of every decision.
+        answers: Of the compiled ones, by precision.
     """
 
-    def __init__(self, controller: GPMPC, compiled: CompiledController):
+    def __init__(self, controller: GPMPC, precisions: Sequence[Any]):
         self.horizon = controller.horizon
         self.problem = controller.problem
         self.initial_input = controller.initial_input
         self._controller = controller
-        self._compiled = compiled
-        self.differences: list[Array] = []
         self.inputs: list[Array] = []
-        self.other_statuses: Counter[str] = Counter()
         self.statuses: Counter[str] = Counter()
-        self.seconds: list[tuple[float, float]] = []
+        self.python_seconds: list[float] = []
+        self.answers = {
+            precision: CompiledAnswers(CompiledController(controller, precision))
+            for precision in precisions
+        }
 
     @property
     def signals(self):
@@ -87,17 +89,37 @@ class Comparison:
         """Decides by Python, and compares."""
         began = perf_counter()
         decision = self._controller.control(belief, reference, previous)
-        between = perf_counter()
-        compiled = self._compiled.control(belief, reference, previous)
-        ended = perf_counter()
-        self.seconds.append((between - began, ended - between))
+        self.python_seconds.append(perf_counter() - began)
         self.statuses[decision.status.name] += 1
-        self.differences.append(np.abs(compiled.input - decision.input))
         self.inputs.append(decision.input)
+        for answers in self.answers.values():
+            answers.compare(decision, belief, reference, previous)
+        return decision
+
+
+class CompiledAnswers:
+    """How compiled code answers, beside Python.
+
+    Attributes:
+        differences: Of the inputs (questions, m).
+        other_statuses: Pairs of names, where they differ.
+        seconds: Of every step in C.
+    """
+
+    def __init__(self, compiled: CompiledController):
+        self._compiled = compiled
+        self.differences: list[Array] = []
+        self.other_statuses: Counter[str] = Counter()
+        self.seconds: list[float] = []
+
+    def compare(self, decision, belief, reference, previous) -> None:
+        """Asks what Python was asked."""
+        compiled = self._compiled.control(belief, reference, previous)
+        self.seconds.append(compiled.timing.solve)
+        self.differences.append(np.abs(compiled.input - decision.input))
         if compiled.status is not decision.status:
             names = f"{decision.status.name}, {compiled.status.name}"
             self.other_statuses[names] += 1
-        return decision
 
 
 def paper_quadrotor(horizon: int) -> Case:
@@ -115,14 +137,16 @@ def paper_quadrotor(horizon: int) -> Case:
     )
     path = quadrotor.TRAJECTORIES["lorenz"]
     references = states_along(path, np.arange(STEPS + horizon + 1.0))
-    start = references[0]
+    width = np.asarray(upper, dtype=float) - lower
+    width[np.isinf(width)] = 1.0
 
     def fly(flown: Any, seed: int) -> None:
+        disturbance = np.random.default_rng(seed).uniform(-0.05, 0.05, len(lower))
         closed_loop(
             quadrotor.OUTER,
             flown,
             references,
-            start,
+            references[0] + disturbance * width,
             STEPS,
             noise=quadrotor.NOISE,
             seed=seed,
@@ -157,12 +181,13 @@ def learned_cart_pole() -> Case:
 
     def fly(flown: Any, seed: int) -> None:
         reference = goal.copy()
-        reference[0] = np.random.default_rng(seed).uniform(-1.2, 1.2)
+        rng = np.random.default_rng(seed)
+        reference[0] = rng.uniform(-1.2, 1.2)
         closed_loop(
             plant,
             flown,
             reference,
-            start,
+            start + rng.uniform(-0.3, 0.3, 4),
             STEPS,
             noise=Noise(measurement=[1e-3] * 4),
             seed=seed,
@@ -324,54 +349,60 @@ CASES: dict[str, Callable[[], Case]] = {
 }
 
 
-def compare(name: str, case: Case, questions: int, precision: Any) -> dict[str, Any]:
-    """Asks both a number of questions; returns the row of a table."""
-    compiled = CompiledController(case.controller, precision)
-    comparison = Comparison(case.controller, compiled)
+def compare(
+    name: str, case: Case, questions: int, precisions: Sequence[Any]
+) -> list[dict[str, Any]]:
+    """Asks all of them a number of questions; returns a row for each precision."""
+    comparison = Comparison(case.controller, precisions)
     seed = 0
-    while len(comparison.differences) < questions:
+    while len(comparison.inputs) < questions:
         case.fly(comparison, seed)
         seed += 1
-    differences = np.array(comparison.differences)
     lower, upper = case.controller.problem.inputs.first
     inputs = np.array(comparison.inputs)
     moved = inputs.max(axis=0) - inputs.min(axis=0)
     ranges = np.where(np.isfinite(upper - lower), upper - lower, moved)
-    python, c = np.median(comparison.seconds, axis=0) * 1e3
-    return {
-        "case": name,
-        "precision": precision,
-        "questions": len(differences),
-        "largest": float(differences.max()),
-        "share": float((differences / ranges).max()),
-        "other_statuses": dict(comparison.other_statuses),
-        "statuses": dict(comparison.statuses),
-        "python_ms": float(python),
-        "c_ms": float(c),
-    }
+    rows = []
+    for precision, answers in comparison.answers.items():
+        differences = np.array(answers.differences)
+        rows.append(
+            {
+                "case": name,
+                "precision": precision,
+                "questions": len(differences),
+                "flights": seed,
+                "largest": float(differences.max()),
+                "share": float((differences / ranges).max()),
+                "other_statuses": dict(answers.other_statuses),
+                "statuses": dict(comparison.statuses),
+                "python_ms": 1e3 * float(np.median(comparison.python_seconds)),
+                "c_ms": 1e3 * float(np.median(answers.seconds)),
+            }
+        )
+    return rows
 
 
 def main() -> None:
     """Asks, compares and prints."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--questions", type=int, default=100_000)
+    parser.add_argument("--questions", type=int, default=20_000)
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument("--precisions", nargs="+", default=["double", "float"])
     arguments = parser.parse_args()
     use_one_thread()
-    rows = []
+    table = []
     for name in arguments.cases:
-        case = CASES[name]()
-        for precision in arguments.precisions:
-            row = compare(name, case, arguments.questions, precision)
-            rows.append(row)
+        rows = compare(name, CASES[name](), arguments.questions, arguments.precisions)
+        table += rows
+        for row in rows:
             print(
-                f"{name:18}{precision:8}{row['questions']:8}{row['largest']:10.2g} "
-                f"({row['share']:.2g}) {row['other_statuses'] or 'same statuses'} "
-                f"{row['statuses']} {row['python_ms']:.3f} {row['c_ms']:.3f}",
+                f"{name:18}{row['precision']:8}{row['questions']:8}"
+                f"{row['largest']:10.2g} ({row['share']:.2g}) "
+                f"{row['other_statuses'] or 'same statuses'} {row['statuses']} "
+                f"{row['python_ms']:.3f} {row['c_ms']:.3f}",
                 flush=True,
             )
-    write_results("export", rows)
+    write_results("export", table)
 
 
 if __name__ == "__main__":

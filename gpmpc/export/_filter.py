@@ -64,7 +64,12 @@ class FilterWriter:
         kalman = estimator.filter
         parts = []
         if kalman.model is controller.prediction.model:
-            parts.append("#define filter_model model /* the controller's own */\n")
+            parts += [
+                "/* the controller's own */",
+                "#define filter_model model",
+                "#define filter_model_variances model_variances",
+                "#define filter_model_covariance model_covariance\n",
+            ]
         else:
             model.write(kalman.model, "filter_model")
         measurement = kalman.measurement

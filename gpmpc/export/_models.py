@@ -9,6 +9,7 @@ import numpy as np
 from gpmpc._dynamics import to_array
 from gpmpc.exceptions import SettingError
 from gpmpc.export._expressions import expansion_lines, graph_of_tape, value_lines
+from gpmpc.export._fixed import fixed_tables
 from gpmpc.export._text import Numbers, function, integers, split_jacobian
 from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, DelayedModel, DisturbedModel, KnownModel, ResidualModel
@@ -17,8 +18,8 @@ from gpmpc.models._wrapper import LinearWrapper
 Array = np.ndarray
 
 _SIGNATURE = (
-    "static void {name}(const real *x, const real *u, wide *memory, real *mean,\n"
-    "    real *A, real *B, real *V)"
+    "static void {name}(const real *x, const real *u, gpmpc_work *work,\n"
+    "    real *mean, real *A, real *B)"
 )
 _TAPE_SIGNATURE = "static void {name}(const real *x, const real *u, real *value)"
 _TAPE_EXPANSION = (
@@ -32,7 +33,7 @@ class ModelWriter:
     """Writes the functions and tables of one model.
 
     Attributes:
-        memory: Numbers that the model's functions are lent to work in.
+        sizes: Of what its functions work in: N, d N, k N and k, at most.
     """
 
     def __init__(self, numbers: Numbers, variances: bool, means_alone: bool):
@@ -41,26 +42,14 @@ class ModelWriter:
         self._means_alone = means_alone
         self._parts: list[str] = []
         self._gps = 0
-        self.memory = 0
+        self.sizes: dict[str, int] = dict.fromkeys(
+            ("POINTS", "DIFFERENCES", "KERNELS", "GP_OUTPUTS"), 0
+        )
 
     @property
     def text(self) -> str:
         """All that was written."""
         return "\n".join(self._parts)
-
-    @property
-    def _wanted_variance(self) -> str:
-        """The argument of a function that may write variances."""
-        return "V ? variance : 0" if self._variances else "0"
-
-    @property
-    def _ignored_variance(self) -> list[str]:
-        """The line that says that no variance is written."""
-        return [] if self._variances else ["(void)V;"]
-
-    def _variance_array(self, size: int) -> list[str]:
-        """The line that declares variances, where they are wanted."""
-        return [f"real variance[{size}];"] if self._variances else []
 
     def write(self, model: Any, name: str) -> None:
         """Writes the function of a model.
@@ -96,13 +85,10 @@ class ModelWriter:
         body = [
             f"real query[{d}];",
             f"real jacobian[{k * d}];",
-            *self._variance_array(k),
             "int i;",
-            *self._ignored_variance,
             f"copy(x, query, {n});",
             f"copy(u, query + {n}, {m});",
-            f"gp_evaluate(&{table}, query, memory, mean, A ? jacobian : 0,",
-            f"            {self._wanted_variance});",
+            f"gp_evaluate(&{table}, query, work, mean, A ? jacobian : 0);",
         ]
         body += split_jacobian(k, n, m)
         if adds_state:
@@ -111,9 +97,9 @@ class ModelWriter:
                 f"for (i = 0; i < {n} && A; i++)",
                 f"    A[i * {n} + i] += 1;",
             ]
-        if self._variances:
-            body += _diagonal_variance(k)
         self._function(_SIGNATURE.format(name=name), body, f"x+ = {what}, f by GPs")
+        self._write_variances(name, table)
+        self._write_covariance(name, _diagonal_variance(k))
 
     def _write_gps(self, gp: GPPosterior) -> str:
         """Writes the tables of GPs over the same points; returns their name."""
@@ -123,7 +109,7 @@ class ModelWriter:
         self._gps += 1
         size, d = gp.features.shape
         k = gp.output_dim
-        self.memory = max(self.memory, (d + 2) * size)
+        self._reserve(size, d, k)
         features = to_array(gp.features)
         lengthscales = to_array(gp.lengthscales)
         table = partial(Numbers("double").table, kind="wide")
@@ -140,6 +126,7 @@ class ModelWriter:
                 np.log(to_array(gp.signal_variance)),
                 "log sf2 (k,)",
             ),
+            table(f"{prefix}_signal", to_array(gp.signal_variance), "sf2 (k,)"),
             table(f"{prefix}_weights", to_array(gp.weights), "beta (k, N)"),
             table(f"{prefix}_offset", to_array(gp.offset), "prior means (k,)"),
         ]
@@ -150,14 +137,29 @@ class ModelWriter:
             factors = to_array(gp.cholesky)[:, rows, columns]
             comment = "K + sn2 I = L L': lower triangles, row after row"
             parts.append(table(cholesky, factors, comment))
+        fixed = ""
+        if self._numbers.precision == "float":
+            parts.append(fixed_tables(gp, prefix))
+            fixed = f", &{prefix}_fixed"
         parts.append(
             f"static const gp_tables {prefix} = {{\n"
             f"    {size}, {d}, {k}, {prefix}_points, {prefix}_scales,\n"
-            f"    {prefix}_log_signal, {prefix}_weights, {prefix}_offset,\n"
-            f"    {cholesky}}};\n"
+            f"    {prefix}_log_signal, {prefix}_signal, {prefix}_weights,\n"
+            f"    {prefix}_offset, {cholesky}{fixed}}};\n"
         )
         self._parts.append("\n".join(parts))
         return prefix
+
+    def _reserve(self, points: int, features: int, outputs: int) -> None:
+        """Makes room for GPs of N points, d features and k outputs."""
+        needed = {
+            "POINTS": points,
+            "DIFFERENCES": features * points,
+            "KERNELS": outputs * points if self._variances else 0,
+            "GP_OUTPUTS": outputs,
+        }
+        for name, size in needed.items():
+            self.sizes[name] = max(self.sizes[name], size)
 
     def _write_residual(self, model: ResidualModel, name: str) -> None:
         """Writes x+ = f0(x, u) + B d(phi(x, u))."""
@@ -190,24 +192,21 @@ class ModelWriter:
             f"real slopes[{d}];",
             f"real residual[{k}];",
             f"real jacobian[{k * d}];",
-            *self._variance_array(k),
             "int a, i, j;",
-            *self._ignored_variance,
             f"{name}_nominal(x, u, mean, A, B);",
             *_query_lines(features, name),
-            f"gp_evaluate(&{table}, query, memory, residual, A ? jacobian : 0,",
-            f"            {self._wanted_variance});",
+            f"gp_evaluate(&{table}, query, work, residual, A ? jacobian : 0);",
             f"for (i = 0; i < {n}; i++)",
             f"    mean[i] += dot({name}_effect + i * {k}, residual, {k});",
             *_residual_slope_lines(model, name),
         ]
-        if self._variances:
-            body += _residual_variance_lines(n, k, name)
         self._function(
             _SIGNATURE.format(name=name),
             body,
             "x+ = f0(x, u) + B d(phi(x, u)), d by GPs",
         )
+        self._write_variances(name, table)
+        self._write_covariance(name, _residual_variance_lines(n, k, name))
 
     def _write_nominal(self, nominal: Any, n: int, m: int, name: str) -> None:
         """Writes f0 and its derivatives."""
@@ -282,12 +281,13 @@ class ModelWriter:
         m = model.input_dim
         self._write_nominal(model.function, n, m, f"{name}_nominal")
         body = [
-            "(void)memory;",
+            "(void)work;",
             f"{name}_nominal(x, u, mean, A, B);",
-            "if (V)",
-            f"    fill(V, 0, {n * n});",
         ]
         self._function(_SIGNATURE.format(name=name), body, "x+ = f0(x, u)")
+        self._write_variances(name, "")
+        no_variance = ["(void)variance;", f"fill(V, 0, {n * n});"]
+        self._write_covariance(name, no_variance)
 
     def _write_wrapper(self, model: LinearWrapper, name: str) -> None:
         """Writes z+ = [f(x, Z z + W u); 0] + L z + M u."""
@@ -309,28 +309,44 @@ class ModelWriter:
             f"real next[{p}];",
             f"real by_state[{p * p}];",
             f"real by_input[{p * m}];",
-            *self._variance_array(p * p),
             "int i;",
-            *self._ignored_variance,
             f"for (i = 0; i < {m}; i++)",
             f"    acting[i] = dot({name}_Z + i * {n}, x, {n})",
             f"                + dot({name}_W + i * {m}, u, {m});",
-            f"{inner}(x, acting, memory, next, A ? by_state : 0, A ? by_input : 0,",
-            f"      {self._wanted_variance});",
+            f"{inner}(x, acting, work, next, A ? by_state : 0, A ? by_input : 0);",
             f"for (i = 0; i < {n}; i++)",
             f"    mean[i] = dot({name}_L + i * {n}, x, {n})",
             f"              + dot({name}_M + i * {m}, u, {m})",
             f"              + (i < {p} ? next[i] : 0);",
             *_wrapped_slope_lines(n, m, p, name),
         ]
-        if self._variances:
-            body += _padded_variance_lines(n, p)
         what = "z+ = [f(x, Z z + W u); 0] + L z + M u"
         if isinstance(model, DelayedModel):
             what += f": inputs act {model.delay:g} steps late"
         elif isinstance(model, DisturbedModel):
             what += ": disturbances are states"
         self._function(_SIGNATURE.format(name=name), body, what)
+        if self._variances:
+            line = f"#define {name}_variances {inner}_variances\n"
+            self._parts.append(line)
+        self._write_covariance(name, _padded_variance_lines(n, p, inner))
+
+    def _write_variances(self, name: str, table: str) -> None:
+        """Writes the function of the GPs' variances at the points that were kept."""
+        if not self._variances:
+            return
+        body = ["(void)work;", "(void)variance;"]
+        if table:
+            body = [f"gp_variances(&{table}, work, variance);"]
+        signature = f"static void {name}_variances(gpmpc_work *work, real *variance)"
+        self._function(signature, body, "variances of the GPs (lanes, k)")
+
+    def _write_covariance(self, name: str, body: Sequence[str]) -> None:
+        """Writes the function from the GPs' variances at a point to V (n, n)."""
+        if not self._variances:
+            return
+        signature = f"static void {name}_covariance(const real *variance, real *V)"
+        self._function(signature, body, "V: covariance of the next state")
 
     def _nominal_function(self, name: str, body: Sequence[str], comment: str) -> None:
         """Writes a nominal function."""
@@ -388,7 +404,8 @@ def _residual_slope_lines(model: ResidualModel, name: str) -> list[str]:
 def _residual_variance_lines(n: int, k: int, name: str) -> list[str]:
     """Returns the lines that write V = B diag(variance) B'."""
     return [
-        f"for (i = 0; i < {n} && V; i++)",
+        "int a, i, j;",
+        f"for (i = 0; i < {n}; i++)",
         f"    for (j = 0; j < {n}; j++) {{",
         f"        V[i * {n} + j] = 0;",
         f"        for (a = 0; a < {k}; a++)",
@@ -417,25 +434,25 @@ def _wrapped_slope_lines(n: int, m: int, p: int, name: str) -> list[str]:
     ]
 
 
-def _padded_variance_lines(n: int, p: int) -> list[str]:
+def _padded_variance_lines(n: int, p: int, inner: str) -> list[str]:
     """Returns the lines that write V of a wrapper, zero but for the p inner states."""
     return [
-        "if (V) {",
-        f"    fill(V, 0, {n * n});",
-        f"    for (i = 0; i < {p}; i++)",
-        f"        copy(variance + i * {p}, V + i * {n}, {p});",
-        "}",
+        f"real block[{p * p}];",
+        "int i;",
+        f"{inner}_covariance(variance, block);",
+        f"fill(V, 0, {n * n});",
+        f"for (i = 0; i < {p}; i++)",
+        f"    copy(block + i * {p}, V + i * {n}, {p});",
     ]
 
 
 def _diagonal_variance(k: int) -> list[str]:
     """Returns the lines that write V = diag(variance)."""
     return [
-        "if (V) {",
-        f"    fill(V, 0, {k * k});",
-        f"    for (i = 0; i < {k}; i++)",
-        f"        V[i * {k} + i] = variance[i];",
-        "}",
+        "int i;",
+        f"fill(V, 0, {k * k});",
+        f"for (i = 0; i < {k}; i++)",
+        f"    V[i * {k} + i] = variance[i];",
     ]
 
 

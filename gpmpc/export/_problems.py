@@ -1,5 +1,6 @@
 """A controller's dimensions, settings, weights and bounds as C."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +28,10 @@ _COMMENTS = {
     "GPMPC_ROWS": "rows of the states' constraints at a stage, r",
     "GPMPC_PARAMETERS": "of outputs and inequalities, q",
     "GPMPC_ITERATIONS": "changes of the working set; 0: 100 + 10 per constraint",
-    "GPMPC_MODEL_MEMORY": "numbers that the model works in",
+    "GPMPC_POINTS": "of the GPs, N",
+    "GPMPC_DIFFERENCES": "of a state from the points, d N",
+    "GPMPC_KERNELS": "of a state that are kept for variances, k N",
+    "GPMPC_GP_OUTPUTS": "k",
     "GPMPC_PENALIZED": "what R weighs: 0 inputs, 1 deviations, 2 increments",
     "GPMPC_TOLERANCE": "of a solution, as a share of its size",
     "GPMPC_DISTURBANCE_GAIN": "of the estimate of a constant error",
@@ -72,7 +76,7 @@ def definitions(
     controller: GPMPC,
     numbers: Numbers,
     functions: FunctionWriter,
-    model_memory: int,
+    model_sizes: Mapping[str, int],
     on_failure: str,
     estimator: Estimator | None = None,
 ) -> Definitions:
@@ -95,7 +99,6 @@ def definitions(
         "GPMPC_ROWS": str(constraints.per_stage),
         "GPMPC_PARAMETERS": str(functions.parameters),
         "GPMPC_ITERATIONS": str(getattr(solver, "iteration_limit", None) or 0),
-        "GPMPC_MODEL_MEMORY": str(model_memory),
         "GPMPC_PENALIZED": str(cost.penalized),
         "GPMPC_STATE_WEIGHTS": str(len(cost.state)),
         "GPMPC_INPUT_WEIGHTS": str(len(cost.input)),
@@ -104,6 +107,7 @@ def definitions(
         "GPMPC_TOLERANCE": f"(gpmpc_real){tolerance!r}",
         "GPMPC_DISTURBANCE_GAIN": f"(gpmpc_real){float(gain)!r}",
     }
+    values |= {f"GPMPC_{name}": str(size) for name, size in model_sizes.items()}
     values |= filter_definitions(estimator, prediction.state_dim)
     flags = _flags(controller, numbers, on_failure)
     values |= {name: str(int(flag)) for name, flag in flags.items()}

@@ -8,6 +8,7 @@ import numpy as np
 Precision = Literal["double", "float"]
 
 _NUMBERS_A_LINE = 4
+_INTEGERS_A_LINE = 7
 
 
 class Numbers:
@@ -45,12 +46,19 @@ class Numbers:
         return f"{head}static const {kind} {name}[{flat.size}] = {{\n    {body}}};\n"
 
 
-def integers(name: str, values: Sequence[int], comment: str = "") -> str:
+def integers(
+    name: str, values: Sequence[int] | np.ndarray, comment: str = "", kind: str = "int"
+) -> str:
     """Returns a constant array of whole numbers."""
-    listed = [str(int(value)) for value in values] or ["0"]
+    suffix = "u" if kind.startswith("u") else ""
+    listed = [f"{int(value)}{suffix}" for value in values] or ["0"]
     head = f"/* {comment} */\n" if comment else ""
-    body = ", ".join(listed)
-    return f"{head}static const int {name}[{len(listed)}] = {{{body}}};\n"
+    lines = [
+        ", ".join(listed[first : first + _INTEGERS_A_LINE])
+        for first in range(0, len(listed), _INTEGERS_A_LINE)
+    ]
+    body = ",\n    ".join(lines)
+    return f"{head}static const {kind} {name}[{len(listed)}] = {{{body}}};\n"
 
 
 def function(signature: str, body: Sequence[str], note: str) -> str:

@@ -106,7 +106,7 @@ def _texts(
     if estimator is not None:
         filter_tables = FilterWriter(controller, estimator, numbers, model).text
     settings = definitions(
-        controller, numbers, functions, model.memory, on_failure, estimator
+        controller, numbers, functions, model.sizes, on_failure, estimator
     )
     names = _names(controller, estimator)
     header = "\n".join(
@@ -114,6 +114,8 @@ def _texts(
             _banner("A controller in C: its memory and its calls.", names),
             "#ifndef GPMPC_H",
             "#define GPMPC_H",
+            "",
+            "#include <stdint.h>",
             "",
             f"typedef {numbers.precision} gpmpc_real;",
             "",
@@ -124,7 +126,10 @@ def _texts(
             "",
         ]
     )
-    gps = _part("gp.c") if model.memory else ""  # a known model has none
+    gps = ""
+    if model.sizes["POINTS"]:  # a known model has none
+        fixed = _part("fixed.c") if numbers.precision == "float" else ""
+        gps = _part("gp.c").replace("/*{fixed}*/", fixed)
     generated = "\n".join(
         [gps, model.text, filter_tables, tables(controller, numbers), functions.text]
     )

@@ -281,7 +281,7 @@ static void estimate_disturbance(gpmpc_controller *controller, const real *state
         return;
     }
     model(controller->means[0], controller->problem.previous_input,
-          controller->problem.model, mean, 0, 0, 0);
+          &controller->problem.work, mean, 0, 0);
     for (i = 0; i < n; i++) {
         real error = state[i] - mean[i];
         for (a = 0; a < GPMPC_STATE_ANGLE_COUNT; a++)
@@ -292,30 +292,47 @@ static void estimate_disturbance(gpmpc_controller *controller, const real *state
     }
 }
 
+#if GPMPC_TUBES
+/* Writes the model's covariances of the stages first .. last - 1, whose kernels were
+   kept, and the process noise to them. */
+static void write_model_covariances(gpmpc_problem *problem, int first, int last)
+{
+    real variance[GPMPC_LANES * GPMPC_AT_LEAST_ONE(GPMPC_GP_OUTPUTS)];
+    int k;
+    model_variances(&problem->work, variance);
+    for (k = first; k < last; k++) {
+        real *V = &problem->V[k][0][0];
+        model_covariance(variance + (k - first) * GPMPC_GP_OUTPUTS, V);
+        add_scaled(1, process_noise, V, n * n);
+    }
+}
+#endif
+
 /* Linearises the dynamics along the plan: c = f(s, u) + d - A s - B u. */
 static void linearize(gpmpc_controller *controller)
 {
     gpmpc_problem *problem = &controller->problem;
+    gpmpc_work *work = &problem->work;
     real next[GPMPC_STATES];
     int k, i;
     for (k = 0; k < GPMPC_STAGES; k++) {
         const real *s = problem->states[k];
         const real *u = problem->inputs[k];
-        real *V = 0;
 #if GPMPC_TUBES
-        V = &problem->V[k][0][0];
+        work->lane = k % GPMPC_LANES;
 #endif
-        model(s, u, problem->model, next, &problem->A[k][0][0], &problem->B[k][0][0],
-              V);
-#if GPMPC_TUBES
-        add_scaled(1, process_noise, V, n * n);
-#endif
+        model(s, u, work, next, &problem->A[k][0][0], &problem->B[k][0][0]);
         for (i = 0; i < n; i++) {
             real after = next[i] + (GPMPC_ESTIMATES ? controller->disturbance[i] : 0);
             problem->c[k][i] = after - (dot(problem->A[k][i], s, n)
                                         + dot(problem->B[k][i], u, m));
         }
+#if GPMPC_TUBES
+        if (work->lane == GPMPC_LANES - 1 || k == GPMPC_STAGES - 1)
+            write_model_covariances(problem, k - work->lane, k + 1);
+#endif
     }
+    work->lane = -1;
 }
 
 #if GPMPC_INCREMENTAL
@@ -1228,7 +1245,7 @@ static void close_defects(gpmpc_controller *controller)
             }
             inputs[k][i] = within_box(within_rates(u, last, k, i), k, i);
         }
-        model(states[k], inputs[k], problem->model, states[k + 1], 0, 0, 0);
+        model(states[k], inputs[k], &problem->work, states[k + 1], 0, 0);
         for (i = 0; i < n && GPMPC_ESTIMATES; i++)
             states[k + 1][i] += controller->disturbance[i];
     }
@@ -1385,11 +1402,15 @@ static int take_plan(gpmpc_controller *controller)
 
 void gpmpc_reset(gpmpc_controller *controller)
 {
+    int i;
     controller->has_input = 0;
     controller->has_plan = 0;
     controller->failed = 0;
     controller->status = GPMPC_SOLVED;
     controller->violation = 0;
+    controller->problem.work.lane = -1;
+    for (i = 0; i < GPMPC_KERNELS * GPMPC_LANES; i++)
+        controller->problem.work.kernels[i] = 0; /* a lane may never be used */
     controller->solution.rows = -1;
     controller->solution.working = 0;
     controller->solution.status = GPMPC_SOLVED;

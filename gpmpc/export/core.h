@@ -37,6 +37,8 @@ enum gpmpc_status {
 #define GPMPC_G_ROWS (GPMPC_SIZE + GPMPC_RATE_ROWS + GPMPC_STATE_ROWS)
 #define GPMPC_CONSTRAINTS (GPMPC_SIZE + GPMPC_G_ROWS)
 #define GPMPC_SLOTS (GPMPC_SIZE + 1)
+/* points whose variances are computed together */
+#define GPMPC_LANES (GPMPC_TUBES ? 8 : 1)
 /* [s_k; u_{k-1}; 1], of which the feedback is a function */
 #define GPMPC_AUGMENTED (GPMPC_STATES + GPMPC_INPUTS + 1)
 
@@ -56,6 +58,23 @@ typedef struct {
     gpmpc_real covariance[GPMPC_STATES * GPMPC_STATES];
 } gpmpc_belief;
 #endif
+
+/* Where the model works. */
+typedef struct {
+    union {
+        double numbers[GPMPC_AT_LEAST_ONE(GPMPC_DIFFERENCES + 2 * GPMPC_POINTS)];
+#if GPMPC_IS_FLOAT
+        struct {
+            uint64_t kernel[GPMPC_AT_LEAST_ONE(GPMPC_POINTS)];
+            int32_t differences[GPMPC_AT_LEAST_ONE(GPMPC_DIFFERENCES)];
+            uint32_t squares[GPMPC_AT_LEAST_ONE(GPMPC_DIFFERENCES)];
+            int32_t weighted[GPMPC_AT_LEAST_ONE(GPMPC_POINTS)];
+        } whole;
+#endif
+    } in;
+    int lane; /* where the kernels of a point are kept; negative: nowhere */
+    double kernels[GPMPC_AT_LEAST_ONE(GPMPC_KERNELS * GPMPC_LANES)];
+} gpmpc_work;
 
 /* The solution of a quadratic program, from which the next one starts. */
 typedef struct {
@@ -153,7 +172,7 @@ typedef struct {
     gpmpc_real targets[GPMPC_HORIZON + 1][GPMPC_STATES];
     gpmpc_real target_inputs[GPMPC_HORIZON][GPMPC_INPUTS];
     gpmpc_real previous_input[GPMPC_INPUTS];
-    double model[GPMPC_AT_LEAST_ONE(GPMPC_MODEL_MEMORY)]; /* lent to the model */
+    gpmpc_work work;
 } gpmpc_problem;
 
 /* A controller. What it keeps from step to step comes first; a binding of another

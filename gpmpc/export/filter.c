@@ -31,9 +31,14 @@ static void predict_belief(gpmpc_controller *controller)
     real B[GPMPC_STATES * GPMPC_INPUTS];
     real V[GPMPC_STATES * GPMPC_STATES];
     real mean[GPMPC_STATES];
+    real variance[GPMPC_LANES * GPMPC_AT_LEAST_ONE(GPMPC_GP_OUTPUTS)];
     gpmpc_belief *belief = &controller->belief;
-    filter_model(belief->mean, controller->input, controller->problem.model, mean, A, B,
-                 V);
+    gpmpc_work *work = &controller->problem.work;
+    work->lane = 0;
+    filter_model(belief->mean, controller->input, work, mean, A, B);
+    filter_model_variances(work, variance);
+    filter_model_covariance(variance, V);
+    work->lane = -1;
     add_scaled(1, filter_noise, V, n * n);
     copy(mean, belief->mean, n);
     move_covariance(A, V, belief->covariance, belief->covariance);

@@ -67,6 +67,10 @@ static wide wide_dot(const wide *x, const wide *y, int size)
     return total;
 }
 
+#if GPMPC_IS_FLOAT
+typedef struct gp_fixed_tables gp_fixed_tables;
+#endif
+
 /* k GPs over the same N points of d features. */
 typedef struct {
     int points;             /* N */
@@ -75,39 +79,35 @@ typedef struct {
     const wide *x;          /* the points, feature after feature (d, N) */
     const wide *scales;     /* 1 / l^2 (k, d) */
     const wide *log_signal; /* log sf2 (k,) */
+    const wide *signal;     /* sf2 (k,) */
     const wide *weights;    /* beta (k, N) */
     const wide *offset;     /* prior means (k,) */
     const wide *cholesky;   /* lower triangles of K + sn2 I = L L', or NULL */
+#if GPMPC_IS_FLOAT
+    const gp_fixed_tables *fixed; /* in whole numbers, or NULL */
+#endif
 } gp_tables;
 
-/* |L^-1 k|^2, by which the points reduce a variance; k is lost */
-static wide variance_reduction(const wide *L, wide *k, int points)
-{
-    wide total = 0;
-    int i;
-    for (i = 0; i < points; i++) {
-        k[i] = (k[i] - wide_dot(L, k, i)) / L[i];
-        total += k[i] * k[i];
-        L += i + 1;
-    }
-    return total;
-}
-
-/* Evaluates the GPs at x~ (d,), their derivatives (k, d) and variances (k,) where they
-   are wanted; ``memory`` is (d + 2, N).
+/*{fixed}*/
+/* Evaluates the GPs at x~ (d,) and, where they are wanted, their derivatives (k, d).
 
      mean_a = offset_a + sum_i beta_ai k_ai,   k_ai = exp(log sf2_a - |z_i|^2_a / 2)
      d mean_a / dx~_d = sum_i beta_ai k_ai (x~_id - x~_d) / l_ad^2
-     variance_a = sf2_a - |L_a^-1 k_a|^2 */
-static void gp_evaluate(const gp_tables *gp, const real *query, wide *memory,
-                        real *mean, real *jacobian, real *variance)
+
+   The kernels k_ai go to lane ``work->lane``, if it is not negative. */
+static void gp_evaluate(const gp_tables *gp, const real *query, gpmpc_work *work,
+                        real *mean, real *jacobian)
 {
     int count = gp->points;
     int d = gp->features;
-    wide *differences = memory;
-    wide *kernel = memory + d * count;
+    wide *differences = work->in.numbers;
+    wide *kernel = differences + d * count;
     wide *weighted = kernel + count;
     int a, i, j;
+#if GPMPC_IS_FLOAT
+    if (gp->fixed && evaluate_fixed(gp, query, work, mean, jacobian))
+        return;
+#endif
     for (j = 0; j < d; j++)
         for (i = 0; i < count; i++)
             differences[j * count + i] = gp->x[j * count + i] - query[j];
@@ -130,11 +130,75 @@ static void gp_evaluate(const gp_tables *gp, const real *query, wide *memory,
         for (j = 0; j < d && jacobian; j++)
             jacobian[a * d + j] =
                 (real)(scales[j] * wide_dot(weighted, differences + j * count, count));
-        if (variance && gp->cholesky) {
-            const wide *L = gp->cholesky + a * (count * (count + 1) / 2);
-            wide value = exponential(gp->log_signal[a])
-                         - variance_reduction(L, kernel, count);
-            variance[a] = value > 0 ? (real)value : 0;
+#if GPMPC_KERNELS
+        for (i = 0; i < count && work->lane >= 0; i++)
+            work->kernels[(a * count + i) * GPMPC_LANES + work->lane] = kernel[i];
+#endif
+    }
+}
+
+#if GPMPC_KERNELS
+/* Rows of L that are solved together: their sums need not wait for each other. */
+enum { TOGETHER = 4 };
+
+/* total <- sum_j L_ij v_j for each of some rows of L and each lane, j < first. */
+static void known_part(const wide *const *rows, const wide *v, int first,
+                       wide total[TOGETHER][GPMPC_LANES])
+{
+    int i, j, lane;
+    for (i = 0; i < TOGETHER; i++)
+        for (lane = 0; lane < GPMPC_LANES; lane++)
+            total[i][lane] = 0;
+    for (j = 0; j < first; j++)
+        for (i = 0; i < TOGETHER; i++)
+            for (lane = 0; lane < GPMPC_LANES; lane++)
+                total[i][lane] += rows[i][j] * v[j * GPMPC_LANES + lane];
+}
+
+/* v <- L^-1 v for all lanes of v (N, lanes); returns |v|^2 of each. A few rows at a
+   time, so that L is read once for all points. */
+static void whiten(const wide *L, wide *v, int points, wide square[GPMPC_LANES])
+{
+    int first, i, j, lane;
+    for (lane = 0; lane < GPMPC_LANES; lane++)
+        square[lane] = 0;
+    for (first = 0; first < points; first += TOGETHER) {
+        const wide *rows[TOGETHER];
+        wide total[TOGETHER][GPMPC_LANES];
+        int count = points - first < TOGETHER ? points - first : TOGETHER;
+        for (i = 0; i < TOGETHER; i++) {
+            int row = first + (i < count ? i : 0); /* the first again: not used */
+            rows[i] = L + row * (row + 1) / 2;
+        }
+        known_part(rows, v, first, total);
+        for (i = 0; i < count; i++) {
+            wide *now = v + (first + i) * GPMPC_LANES;
+            for (j = 0; j < i; j++)
+                for (lane = 0; lane < GPMPC_LANES; lane++)
+                    total[i][lane] +=
+                        rows[i][first + j] * v[(first + j) * GPMPC_LANES + lane];
+            for (lane = 0; lane < GPMPC_LANES; lane++) {
+                now[lane] = (now[lane] - total[i][lane]) / rows[i][first + i];
+                square[lane] += now[lane] * now[lane];
+            }
         }
     }
 }
+
+/* Writes the variances (lanes, k) of the points whose kernels were kept, which are
+   lost: variance_a = sf2_a - |L_a^-1 k_a|^2 */
+static void gp_variances(const gp_tables *gp, gpmpc_work *work, real *variance)
+{
+    int count = gp->points;
+    int a, lane;
+    for (a = 0; a < gp->outputs; a++) {
+        wide square[GPMPC_LANES];
+        whiten(gp->cholesky + a * (count * (count + 1) / 2),
+                    work->kernels + a * count * GPMPC_LANES, count, square);
+        for (lane = 0; lane < GPMPC_LANES; lane++) {
+            wide value = gp->signal[a] - square[lane];
+            variance[lane * gp->outputs + a] = value > 0 ? (real)value : 0;
+        }
+    }
+}
+#endif
