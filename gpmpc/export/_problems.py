@@ -14,8 +14,8 @@ Array = np.ndarray
 
 # The tolerance of a solver in float, the power of the rounding unit that 1e-9 is.
 _FLOAT_TOLERANCE = 1e-4
-# The largest price in float, in the cost's largest weight.
-_FLOAT_PRICE = 1e3
+# A price that is more than nearly every bound is worth, in the cost's largest weight.
+_EXACT_PRICE = 1e3
 
 
 _COMMENTS = {
@@ -34,6 +34,7 @@ _COMMENTS = {
     "GPMPC_GP_OUTPUTS": "k",
     "GPMPC_PENALIZED": "what R weighs: 0 inputs, 1 deviations, 2 increments",
     "GPMPC_TOLERANCE": "of a solution, as a share of its size",
+    "GPMPC_EXACT_PRICE": "to which larger ones sink where digits do not suffice",
     "GPMPC_DISTURBANCE_GAIN": "of the estimate of a constant error",
 }
 
@@ -90,6 +91,7 @@ def definitions(
     tolerance = float(getattr(solver, "tolerance", 1e-9))
     if numbers.precision == "float":
         tolerance = max(tolerance, _FLOAT_TOLERANCE)
+    exact = _EXACT_PRICE * _largest_weight(controller)
     angles = list(controller.problem.cost.angle_indices)
     values = {
         "GPMPC_STATES": str(prediction.state_dim),
@@ -105,6 +107,7 @@ def definitions(
         "GPMPC_COST_ANGLE_COUNT": str(len(angles)),
         "GPMPC_STATE_ANGLE_COUNT": str(len(prediction.angles)),
         "GPMPC_TOLERANCE": f"(gpmpc_real){tolerance!r}",
+        "GPMPC_EXACT_PRICE": f"(gpmpc_real){exact!r}",
         "GPMPC_DISTURBANCE_GAIN": f"(gpmpc_real){float(gain)!r}",
     }
     values |= {f"GPMPC_{name}": str(size) for name, size in model_sizes.items()}
@@ -155,7 +158,7 @@ def tables(controller: GPMPC, numbers: Numbers) -> str:
         table("row_gradients", rows.F, "of the states' rows by the state (r, n)"),
         table("row_lower", rows.lower, "bounds of the rows (H, r)"),
         table("row_upper", rows.upper),
-        table("row_prices", _prices(controller, numbers), "of violations (r,)"),
+        table("row_prices", constraints.prices, "of violations (r,)"),
         integers("cost_angles", problem.cost.angle_indices, "errors modulo 2 pi"),
         integers("state_angles", prediction.angles, "angles of the cost or the model"),
     ]
@@ -177,27 +180,13 @@ def _optional_tables(controller: GPMPC, numbers: Numbers) -> list[str]:
         parts.append(integers("row_is_smooth", smooth.tolist(), "linearised rows"))
     if tightens(controller):
         kappas = _kappas(controller)
-        noise = prediction.linearizer._noise
+        noise = prediction.linearizer.noise_covariance
         if noise is None:
             noise = np.zeros((prediction.state_dim, prediction.state_dim))
         note = "added to the covariance of a stage (n, n)"
         parts.append(numbers.table("row_kappas", kappas, "deviations to a side"))
         parts.append(numbers.table("process_noise", noise, note))
     return parts
-
-
-def _prices(controller: GPMPC, numbers: Numbers) -> Array:
-    """Returns the prices of rows (r,).
-
-    Six digits say less than an exact price of 1e6 weights: in float it is 1e3 of them,
-    which still is more than nearly every bound is worth.
-    """
-    prices = controller.prediction.constraints.prices
-    if numbers.precision == "double":
-        return prices
-    finite = np.isfinite(prices)
-    exact = finite & (prices >= _FLOAT_PRICE * _largest_weight(controller))
-    return np.where(exact, _FLOAT_PRICE * _largest_weight(controller), prices)
 
 
 def _largest_weight(controller: GPMPC) -> float:

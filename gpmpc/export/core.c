@@ -567,6 +567,7 @@ static int write_rows(gpmpc_problem *problem, const gpmpc_reference *reference)
     return finite;
 }
 
+#if GPMPC_ROLLS_OUT
 /* By how much the plan misses a bound of states, inputs or increments, at most. */
 static real largest_violation(const gpmpc_problem *problem)
 {
@@ -590,6 +591,7 @@ static real largest_violation(const gpmpc_problem *problem)
     }
     return largest;
 }
+#endif
 
 /* Whether the plan keeps the hard rows of the states, nearly. */
 static int keeps_hard_rows(const gpmpc_problem *problem)
@@ -1167,6 +1169,49 @@ static void lower_elastic_prices(gpmpc_controller *controller)
     solve(&controller->program, problem->prices, solution, solution);
     if (solution->status != GPMPC_SOLVED)
         solve(&controller->program, problem->prices, free_solution, solution);
+    if (solution->status != GPMPC_SOLVED) { /* from no working set at all */
+        free_solution->rows = -1;
+        solve(&controller->program, problem->prices, free_solution, solution);
+    }
+}
+#endif
+
+#if GPMPC_SOFT
+/* Solves again where the exact prices took more digits than there are: a thousandth of
+   them still is more than a bound that can be kept is worth. */
+static void lower_exact_prices(gpmpc_controller *controller)
+{
+    gpmpc_problem *problem = &controller->problem;
+    gpmpc_solution *solution = &controller->candidate;
+    int lowered = 0;
+    int e;
+    if (solution->status != GPMPC_NUMERICAL_TROUBLE
+        && solution->status != GPMPC_ITERATION_LIMIT)
+        return;
+    for (e = 0; e < r; e++)
+        if (problem->prices[e] > GPMPC_EXACT_PRICE && problem->prices[e] < LARGEST) {
+            problem->prices[e] = GPMPC_EXACT_PRICE;
+            lowered = 1;
+        }
+    if (lowered)
+        solve(&controller->program, problem->prices, &controller->solution, solution);
+}
+#endif
+
+#if !GPMPC_ROLLS_OUT
+/* By how much a solution misses a bound of its program, at most: there a bound counts
+   from the plan that was linearised, and keeps the digits that a state far from zero
+   has not. */
+static real program_violation(const gpmpc_program *program, const real *x)
+{
+    real largest = 0;
+    int p;
+    for (p = 0; p < N + program->rows; p++) {
+        real value = p < N ? x[p] : dot(program->G[p - N], x, N);
+        largest = larger(largest, larger(value - program->upper[p],
+                                         program->lower[p] - value));
+    }
+    return largest;
 }
 #endif
 
@@ -1301,6 +1346,9 @@ static int decide(gpmpc_controller *controller, const real *state,
         return GPMPC_FUNCTION_NOT_FINITE;
     condense(controller);
     solve(&controller->program, problem->prices, &controller->solution, solution);
+#if GPMPC_SOFT
+    lower_exact_prices(controller);
+#endif
 #if GPMPC_ELASTIC
     lower_elastic_prices(controller);
 #endif
@@ -1315,7 +1363,11 @@ static int decide(gpmpc_controller *controller, const real *state,
 #endif
 #endif
     *applicable = status == GPMPC_SOLVED || keeps_hard_rows(problem);
+#if GPMPC_ROLLS_OUT
     controller->violation = largest_violation(problem);
+#else
+    controller->violation = program_violation(&controller->program, solution->x);
+#endif
     if (status == GPMPC_SOLVED && controller->violation > KEPT)
         return GPMPC_SOFT_BOUND_MISSED;
     return status;

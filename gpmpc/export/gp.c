@@ -141,11 +141,29 @@ static void gp_evaluate(const gp_tables *gp, const real *query, gpmpc_work *work
 /* Rows of L that are solved together: their sums need not wait for each other. */
 enum { TOGETHER = 4 };
 
+#if defined(__GNUC__)
+/* The lanes of a point as one value: gcc leaves loops over them as they are, which
+   takes ten times as long. */
+__extension__ typedef wide lanes
+    __attribute__((vector_size(GPMPC_LANES * sizeof(wide))));
+#endif
+
 /* total <- sum_j L_ij v_j for each of some rows of L and each lane, j < first. */
 static void known_part(const wide *const *rows, const wide *v, int first,
                        wide total[TOGETHER][GPMPC_LANES])
 {
-    int i, j, lane;
+    int i, j;
+#if defined(__GNUC__)
+    lanes sums[TOGETHER] = {{0}};
+    for (j = 0; j < first; j++) {
+        lanes now;
+        memcpy(&now, v + j * GPMPC_LANES, sizeof now);
+        for (i = 0; i < TOGETHER; i++)
+            sums[i] += rows[i][j] * now;
+    }
+    memcpy(total, sums, sizeof sums);
+#else
+    int lane;
     for (i = 0; i < TOGETHER; i++)
         for (lane = 0; lane < GPMPC_LANES; lane++)
             total[i][lane] = 0;
@@ -153,6 +171,7 @@ static void known_part(const wide *const *rows, const wide *v, int first,
         for (i = 0; i < TOGETHER; i++)
             for (lane = 0; lane < GPMPC_LANES; lane++)
                 total[i][lane] += rows[i][j] * v[j * GPMPC_LANES + lane];
+#endif
 }
 
 /* v <- L^-1 v for all lanes of v (N, lanes); returns |v|^2 of each. A few rows at a
