@@ -22,7 +22,7 @@ def check_exportable(controller: Any, on_failure: str) -> None:
 
 def _check_programs(controller: GPMPC) -> None:
     """Raises unless a step takes one program."""
-    if controller._most_programs > 1:
+    if controller.most_programs > 1:
         rule = "an exported step takes one program; fly with iterations=1 first"
         raise SettingError("iterations", f"{rule}; got {controller.iterations}")
 

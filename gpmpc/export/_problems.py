@@ -158,7 +158,7 @@ def tables(controller: GPMPC, numbers: Numbers) -> str:
         table("row_gradients", rows.F, "of the states' rows by the state (r, n)"),
         table("row_lower", rows.lower, "bounds of the rows (H, r)"),
         table("row_upper", rows.upper),
-        table("row_prices", constraints.prices, "of violations (r,)"),
+        table("row_prices", prediction.constraints.prices, "of violations (r,)"),
         integers("cost_angles", problem.cost.angle_indices, "errors modulo 2 pi"),
         integers("state_angles", prediction.angles, "angles of the cost or the model"),
     ]

@@ -1149,7 +1149,8 @@ static void lower_elastic_prices(gpmpc_controller *controller)
     gpmpc_solution *free_solution = &controller->elastic;
     real inputs[GPMPC_SIZE];
     real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
-    real last_cost;
+    real last_cost, price;
+    int attempt;
     if (keeps_elastic_rows(problem, solution))
         return;
     if (solution->status != GPMPC_SOLVED) {
@@ -1165,13 +1166,14 @@ static void lower_elastic_prices(gpmpc_controller *controller)
     set_elastic_price(problem, REAL(1e-9)); /* next to nothing: rows keep their place */
     solve(&controller->program, problem->prices, solution, free_solution);
     expand(problem, free_solution->x, inputs, states);
-    set_elastic_price(problem, elastic_price(problem, states, inputs, last_cost));
-    solve(&controller->program, problem->prices, solution, solution);
-    if (solution->status != GPMPC_SOLVED)
-        solve(&controller->program, problem->prices, free_solution, solution);
-    if (solution->status != GPMPC_SOLVED) { /* from no working set at all */
-        free_solution->rows = -1;
-        solve(&controller->program, problem->prices, free_solution, solution);
+    price = elastic_price(problem, states, inputs, last_cost);
+    for (attempt = 0; attempt < 4; attempt++) { /* a price may take too many digits */
+        const gpmpc_solution *start = attempt ? free_solution : solution;
+        set_elastic_price(problem, price);
+        solve(&controller->program, problem->prices, start, solution);
+        if (solution->status == GPMPC_SOLVED)
+            return;
+        price /= 30;
     }
 }
 #endif

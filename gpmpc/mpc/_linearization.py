@@ -394,10 +394,10 @@ class StageLinearizer:
         at_means = zero_order and first_order
         self.needs_no_covariance = covariance == "none" or at_means
         noisy = zero_order and getattr(propagator, "process_noise", False)
-        self._noise = to_array(model.noise_covariance) if noisy else None
+        self.noise_covariance = to_array(model.noise_covariance) if noisy else None
         self.noise = np.zeros(self._n)
-        if self._noise is not None:
-            self.noise = np.ascontiguousarray(np.diagonal(self._noise))
+        if self.noise_covariance is not None:
+            self.noise = np.ascontiguousarray(np.diagonal(self.noise_covariance))
         by_mode: dict[str, _Linearize] = {
             "full": self._linearize_roots,
             "diagonal": self._linearize_deviations,
@@ -472,8 +472,8 @@ class StageLinearizer:
         V = local.covariance
         if V is None:
             V = np.zeros((len(states), self._n, self._n))
-        if self._noise is not None:
-            V = V + self._noise
+        if self.noise_covariance is not None:
+            V = V + self.noise_covariance
         # a model may give views, which the kernels do not notice
         return (
             np.ascontiguousarray(local.mean, dtype=np.float64),

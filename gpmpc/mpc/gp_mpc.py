@@ -204,6 +204,11 @@ class GPMPC:
         self._scales = data_scales(model)
 
     @property
+    def most_programs(self) -> int:
+        """Quadratic programs that a step takes at most."""
+        return self._most_programs
+
+    @property
     def signals(self) -> Signals:
         """Names of states and inputs, and time step, as far as the model knows them."""
         return self.prediction.signals
