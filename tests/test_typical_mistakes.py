@@ -30,7 +30,8 @@ from gpmpc.gp import (
     train,
 )
 from gpmpc.logs import read_log
-from gpmpc.models import DelayedModel, ResidualModel
+from gpmpc.models import Affine, DelayedModel, ResidualModel, save_model
+from gpmpc.models import train as train_model
 from gpmpc.mpc import (
     GPMPC,
     Box,
@@ -48,7 +49,7 @@ from gpmpc.plotting import flight_figure
 from gpmpc.propagation import Linearization
 from gpmpc.recording import McapRecorder, RecordedSystem, read_run
 from gpmpc.signals import Signals
-from gpmpc.simulation import Gust, Noise, closed_loop, closed_loops
+from gpmpc.simulation import Dropout, Gust, Noise, closed_loop, closed_loops
 from gpmpc.studies.flight import Experiment, run_trial
 from gpmpc.systems import System, pendulum, step, step_many
 from gpmpc.trajectories import Hover, Waypoints
@@ -610,6 +611,93 @@ STUDIES = {
         "states.x.unit: 'parsec' is an unknown unit",
     ),
 }
+FURTHER = {
+    "the class of a trainer": (
+        lambda: train_model(data(), trainer=Trainer),
+        "trainer: must be Trainer(...); got Trainer",
+    ),
+    "a trainer by its name": (
+        lambda: train_model(data(), trainer="sparse"),
+        "trainer: must be Trainer(...); got 'sparse'",
+    ),
+    "rows as an array": (
+        lambda: train_model(X),
+        "transitions: must be Transitions(...); got ndarray",
+    ),
+    "the function that makes a system": (
+        lambda: train_model(data(), system=pendulum),
+        "system: must be a System, such as",
+    ),
+    "kinematics as yes and no": (
+        lambda: train_model(data(), system=PLANT, kinematics=True),
+        "kinematics: must be one of 'integrated', 'learned'",
+    ),
+    "one deviation for all states of random data": (
+        lambda: RandomData(samples=5, noise=0.1),
+        "data.noise: must be a list of standard deviations",
+    ),
+    "random data of dynamics": (
+        lambda: RandomData(samples=5).transitions(Cart()),
+        "system: must be a plant, such as System(",
+    ),
+    "rates as a pair": (
+        lambda: System(Cart(), 0.1, rates=("speed", "position")),
+        "rates: must map names, as {name: ...}",
+    ),
+    "an angle by its index": (
+        lambda: System(pendulum().dynamics, 0.05, angles=[0]),
+        "angles: must name states, angle, rate; got 0",
+    ),
+    "a region a row a state": (
+        lambda: System(Cart(), 0.1, region=[[-1, 1], [-1, 1], [0, 1]]),
+        "region: must be the smallest and the largest states",
+    ),
+    "a region upside down": (
+        lambda: System(Cart(), 0.1, region=[[1, 1], [-1, -1]]),
+        "region: must not cross",
+    ),
+    "a training as a model": (
+        lambda: controller(model=Trainer(restarts=0)(data())),
+        "model: must be a DynamicsModel, such as GPPosterior; got Training",
+    ),
+    "a cost as a problem": (
+        lambda: controller(problem=COST),
+        "problem: must be Problem(...); got Tracking",
+    ),
+    "the class of a propagator": (
+        lambda: controller(propagator=Linearization),
+        "propagator: must be an object with the method 'propagate'",
+    ),
+    "the class of a controller": (
+        lambda: fly(controller=GPMPC),
+        "controller: must be an object with the method 'control'",
+    ),
+    "one number as noise of a flight": (
+        lambda: fly(noise=0.1),
+        "noise: must be Noise(...); got 0.1",
+    ),
+    "half a step": (lambda: fly(steps=2.5), "steps: must be a whole number"),
+    "a reference of another system": (
+        lambda: fly(references=[1.0, 0.0, 0.0]),
+        "state and reference must have shapes (2,) and (6, 2)",
+    ),
+    "a dropout that ends before it begins": (
+        lambda: Dropout(start=2.0, stop=1.0),
+        "stop: must be a number above 2.0 [s]; got 1.0",
+    ),
+    "a model of arrays": (
+        lambda: Affine(np.eye(2), np.ones((2, 1)), np.zeros(2)),
+        "A: must be a torch tensor; got ndarray",
+    ),
+    "a folder that is not there": (
+        lambda: save_model(gp(), "missing/folder/model.safetensors"),
+        "missing/folder/model.safetensors: the folder",
+    ),
+    "a controller drawn": (
+        lambda: flight_figure(controller(), PLANT),
+        "rollout: must be a Rollout of closed_loop; got GPMPC",
+    ),
+}
 ROOMS = {
     "systems": SYSTEMS,
     "data": DATA,
@@ -617,6 +705,7 @@ ROOMS = {
     "controllers": CONTROLLERS,
     "loops": LOOPS,
     "studies": STUDIES,
+    "further": FURTHER,
 }
 CALLS = {
     f"{room}: {name}": row for room, rows in ROOMS.items() for name, row in rows.items()

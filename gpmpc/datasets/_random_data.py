@@ -5,7 +5,7 @@ Data of any system, without a controller.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -62,6 +62,9 @@ class RandomData:
         check_number("data.amplitude", self.amplitude, above=0)
         check_choice("data.starts", self.starts, ("region", "start"))
         check_choice("data.around", self.around, ("middle", "initial_input"))
+        if np.ndim(cast(Any, self.noise)) == 0 and self.noise is not None:
+            rule = "must be a list of standard deviations, one for every state"
+            raise SettingError("data.noise", f"{rule}; got {self.noise!r}")
         for value in () if self.noise is None else self.noise:
             check_number("data.noise", value, least=0)
 

@@ -82,6 +82,8 @@ def train(
         raise SettingError(
             ", ".join(settings), "are settings of a Trainer: give them to `trainer`"
         )
+    if trainer is not None:
+        _check_trainer(trainer)
     if system is None:
         trainer = trainer or Trainer(**settings)
         return trainer(transitions, seed=seed)
@@ -92,6 +94,13 @@ def train(
         defaults = {"predicts": "difference", "scaling": standardize}
         trainer = Trainer(**(defaults | settings))
     return _train_on_system(transitions, system, trainer, kinematics, seed)
+
+
+def _check_trainer(trainer: Any) -> None:
+    """Raises ``SettingError`` unless it is an object that trains."""
+    if isinstance(trainer, type) or not callable(trainer):
+        got = trainer.__name__ if isinstance(trainer, type) else repr(trainer)
+        raise SettingError("trainer", f"must be Trainer(...); got {got}")
 
 
 def _named(transitions: Transitions, system: System) -> Transitions:
