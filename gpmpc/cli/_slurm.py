@@ -40,6 +40,7 @@ _MOST_TASKS = 1000  # of an array, where Slurm does not say
 _FIRST_LOOK = 0.5  # after which the queue is looked at again [s]
 _LAST_LOOK = 10.0  # at most [s]
 _SLOWER = 1.3  # each look comes later than the one before by this factor
+_WAITS = (2.0, 10.0, 30.0)  # before a submission is tried again [s]
 _SILENCE = 60.0  # of Slurm, after which that is said [s]
 _TAIL = 4000  # characters of a log that are read
 _FORMAT = "%j|%K|%F_%K|%T|%r|%N"
@@ -68,6 +69,11 @@ _GIVEN_UP = (
     "launch failed requeued held",
     "JobHoldMaxRequeue",
     "DependencyNeverSatisfied",
+)
+# What sbatch writes where Slurm has too much to do, or restarts.
+_BUSY = re.compile(
+    r"timed out|unable to contact|connection (refused|reset)|temporarily|try again",
+    re.IGNORECASE,
 )
 # What ``_slurm_job`` prints.
 _OWN_ERROR = re.compile(r"^gpmpc: error: (.+)$", re.MULTILINE)
@@ -221,11 +227,13 @@ class Slurm:
         words = [
             f"--{key}={value}" for key, value in options.items() if value is not None
         ]
-        answer = _run(["sbatch", "--parsable", *words], script=self._script(folder))
-        if answer.returncode:
-            shutil.rmtree(folder)
-            raise GpmpcError(f"Slurm refuses the sweep: {_one_line(answer.stderr)}")
-        write_whole(folder / _SUBMITTED, answer.stdout)
+        try:
+            job = _sbatch(words, self._script(folder), name)
+        except GpmpcError:
+            if _queue() is not None:  # so that it is known that no job needs the folder
+                shutil.rmtree(folder)
+            raise
+        write_whole(folder / _SUBMITTED, f"{job}\n")
         return _Array(name, folder, chunks, {*range(len(chunks))})
 
     def _script(self, folder: Path) -> str:
@@ -378,6 +386,29 @@ def _done_on(log: str) -> str:
     """Returns the host on which a job came to its end; empty if it did not."""
     last_line = log.rstrip().rpartition("\n")[2]
     return last_line.removeprefix(DONE) if last_line.startswith(DONE) else ""
+
+
+def _sbatch(options: Sequence[str], script: str, name: str) -> str:
+    """Submits an array; where Slurm is too busy to answer, again, unless it took it.
+
+    Returns:
+        The number of its job.
+
+    Raises:
+        GpmpcError: Slurm refuses it, or stays busy.
+    """
+    for wait in (*_WAITS, None):
+        answer = _run(["sbatch", "--parsable", *options], script=script)
+        if answer.returncode == 0:
+            return answer.stdout.strip()
+        jobs = _queue() or {}
+        numbers = [job.number for (array, _), job in jobs.items() if array == name]
+        if numbers:
+            return numbers[0].partition("_")[0]
+        if wait is None or not _BUSY.search(answer.stderr):
+            break
+        time.sleep(wait)
+    raise GpmpcError(f"Slurm refuses the sweep: {_one_line(answer.stderr)}")
 
 
 def _queue() -> dict[tuple[str, int], _Job] | None:

@@ -22,6 +22,9 @@ from tests.cli.launched import fly, in_chunks, jobs_of
 # and what stands in `logs` is there as soon as an array has been submitted.
 SBATCH = """#!/bin/sh
 [ -e "$FAKE/refusal" ] && { cat "$FAKE/refusal" >&2; exit 1; }
+busy=
+[ -e "$FAKE/busy" ] && { busy=$(cat "$FAKE/busy"); rm "$FAKE/busy"; }
+[ "$busy" = refuses ] && { echo "Unable to contact slurm controller" >&2; exit 1; }
 echo "$@" >> "$FAKE/submitted"
 cat > "$FAKE/script"
 for word in "$@"; do case "$word" in
@@ -29,6 +32,7 @@ for word in "$@"; do case "$word" in
   --output=*) folder=$(dirname "${word#*=}") ;;
 esac; done
 cp "$FAKE"/logs/*.log "$folder" 2> /dev/null
+[ -n "$busy" ] && { echo "Socket timed out on send/recv operation" >&2; exit 1; }
 echo 7
 """
 SQUEUE = """#!/bin/sh
@@ -282,6 +286,18 @@ def test_a_refused_submission_is_one_line_and_leaves_nothing(fake, tree):
     ):
         outcomes(tree, [job])
     assert not [*tree.glob(".slurm/gpmpc-*")]
+
+
+@pytest.mark.parametrize("answer", ["refuses", "takes it"])
+def test_a_busy_slurm_gets_an_array_once(answer, fake, tree, monkeypatch):
+    monkeypatch.setattr(_slurm, "_WAITS", (0.0,))
+    (fake / "busy").write_text(answer)
+    (fake / "queue").write_text("0|COMPLETED|None|n1\n")
+    (job,) = jobs_of(tree, "flies")
+    assert outcomes(tree, [job], flown_before=["0-flies"]) == ["finished"]
+    assert len((fake / "submitted").read_text().splitlines()) == 1
+    (array,) = tree.glob(".slurm/gpmpc-*")
+    assert (array / "submitted").read_text() == "7\n"
 
 
 @pytest.mark.parametrize(
