@@ -14,30 +14,7 @@ from types import FrameType
 
 def main() -> None:
     """Runs the command line."""
-    interrupts = []
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        interrupts.append(number)
-        raise KeyboardInterrupt
-
-    def interrupt_again(lost: "sys.UnraisableHookArgs") -> None:
-        """Interrupts once more where an interrupt was lost inside a finaliser.
-
-        Python would print a traceback and go on.
-        """
-        if issubclass(lost.exc_type, KeyboardInterrupt):
-            signal.setitimer(signal.ITIMER_REAL, 0.05)  # once this call is over
-        else:
-            sys.__unraisablehook__(lost)
-
-    ignored = (
-        signal.getsignal(signal.SIGINT) is not signal.default_int_handler
-    )  # as under nohup
-    if not ignored:
-        signal.signal(signal.SIGINT, interrupt)
-        if hasattr(signal, "setitimer"):  # not on Windows
-            signal.signal(signal.SIGALRM, interrupt)
-            sys.unraisablehook = interrupt_again
+    interrupts = _Interrupts()
     try:
         from gpmpc.cli._terminal import usable_streams
 
@@ -46,16 +23,48 @@ def main() -> None:
 
             command()
     except BaseException as error:  # whatever a library made of the interrupt
-        if not interrupts:
+        if not interrupts.came:
             raise
-        advice = (
-            f"; {error}" if isinstance(error, KeyboardInterrupt) and error.args else ""
-        )
+        has_advice = isinstance(error, KeyboardInterrupt) and error.args
+        advice = f"; {error}" if has_advice else ""
         with suppress(OSError):
             print(f"\ninterrupted{advice}", file=sys.stderr)
         sys.exit(130)
     finally:
-        if not ignored:
-            signal.signal(
-                signal.SIGINT, signal.SIG_DFL
-            )  # ends what is still being tidied up, without a traceback
+        interrupts.end_at_once()
+
+
+class _Interrupts:
+    """Makes every Ctrl-C a ``KeyboardInterrupt``; under nohup it stays ignored."""
+
+    def __init__(self) -> None:
+        #: whether there was one
+        self.came = False
+        self._ignored = (
+            signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+        )
+        if self._ignored:
+            return
+        signal.signal(signal.SIGINT, self._raise)
+        if hasattr(signal, "setitimer"):  # not on Windows
+            signal.signal(signal.SIGALRM, self._raise)
+            sys.unraisablehook = self._raise_again
+
+    def end_at_once(self) -> None:
+        """Lets the next one end what is still being tidied up, without a traceback."""
+        if not self._ignored:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    def _raise(self, number: int, frame: FrameType | None) -> None:
+        self.came = True
+        raise KeyboardInterrupt
+
+    def _raise_again(self, lost: "sys.UnraisableHookArgs") -> None:
+        """Interrupts once more where an interrupt was lost inside a finaliser.
+
+        Python would print a traceback and go on.
+        """
+        if issubclass(lost.exc_type, KeyboardInterrupt):
+            signal.setitimer(signal.ITIMER_REAL, 0.05)  # once this call is over
+        else:
+            sys.__unraisablehook__(lost)

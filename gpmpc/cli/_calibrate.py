@@ -15,9 +15,9 @@ from gpmpc import calibration
 from gpmpc._dynamics import DynamicsModel
 from gpmpc._provenance import is_of_this_code
 from gpmpc.cli._commands import Result
+from gpmpc.cli._folders import write_files
 from gpmpc.cli._log import condition
 from gpmpc.cli._recorded import errors_of_settings, experiment_of_run, recordings
-from gpmpc.cli._settings import write_files
 from gpmpc.exceptions import DataError, check_number
 from gpmpc.plotting import calibration_figure, png
 from gpmpc.recording import Run, read_run
@@ -38,11 +38,7 @@ def calibrate(arguments: argparse.Namespace) -> Result:
     path = _only_recording(arguments.run)
     run = read_run(path)
     experiment = experiment_of_run(run, arguments.trust)
-    flights = [
-        read_run(flight)
-        for tree in arguments.flights or [path]
-        for flight in recordings(tree)
-    ]
+    flights = _read_flights(arguments.flights or [path])
     for flight in flights:
         _check_flight(flight, experiment.system, path)
         if not flight.finished:
@@ -64,20 +60,42 @@ def calibrate(arguments: argparse.Namespace) -> Result:
     with console.status("predicting"):
         result = _predict(model, flights, experiment.system, arguments.steps)
     notes.append(f"Intervals hold {result.noise}.")
-    flown = ", ".join(str(flight.path) for flight in flights)
-    document = Document(
-        title=f"How well the model of {path} predicts",
-        tables=[_table(result)],
-        data=result.to_pandas(),
-        lead=f"{result.samples[0]} predictions of {flown}",
-        notes=notes,
-        images={"calibration.png": png(calibration_figure(result))},
-    )
+    document = _document(result, path, flights, notes)
     folder = arguments.to or path.parent / "calibration"
     written = write_files(folder, document.files("calibration"), "to")
     console.print(terminal(document.tables))
     console.out(*notes, written, sep="\n", highlight=False)
     return Result({"folder": str(folder), "rows": document.data.to_dict("records")})
+
+
+def _read_flights(trees: Sequence[Path]) -> list[Run]:
+    """Reads every recording below some folders."""
+    return [read_run(path) for tree in trees for path in recordings(tree)]
+
+
+def _document(
+    result: calibration.Calibration,
+    path: Path,
+    flights: Sequence[Run],
+    notes: Sequence[str],
+) -> Document:
+    """Returns what is written of a calibration.
+
+    Args:
+        result: Of the predictions.
+        path: Recording of the run whose model it is.
+        flights: That were predicted.
+        notes: What a reader has to know.
+    """
+    paths = ", ".join(str(flight.path) for flight in flights)
+    return Document(
+        title=f"How well the model of {path} predicts",
+        tables=[_table(result)],
+        data=result.to_pandas(),
+        lead=f"{result.samples[0]} predictions of {paths}",
+        notes=notes,
+        images={"calibration.png": png(calibration_figure(result))},
+    )
 
 
 def _only_recording(run: Path) -> Path:

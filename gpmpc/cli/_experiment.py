@@ -16,8 +16,8 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from gpmpc._dynamics import DynamicsModel
+from gpmpc.cli._folders import folder_of
 from gpmpc.cli._recorded_settings import checked_settings
-from gpmpc.cli._settings import folder_of
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.logs import SavedModel
 from gpmpc.simulation import Noise

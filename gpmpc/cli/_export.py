@@ -15,8 +15,8 @@ import numpy as np
 from rich.console import Console
 
 from gpmpc.cli._commands import Result
+from gpmpc.cli._folders import writing
 from gpmpc.cli._recorded import errors_of_settings, experiment_of_run, recordings
-from gpmpc.cli._settings import writing
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.export import (
     CompiledLoop,

@@ -116,10 +116,10 @@ class Flying:
             if end.cause is not None:
                 self._end_early(end)
                 continue
-            left = self._unsettled(end.chunk)
+            unsettled = self._unsettled(end.chunk)
             # A chunk may stop behind any of its runs, and leave the others.
-            if len(left) == len(end.chunk.folders):
-                unseen += [(job, end) for job in left]
+            if len(unsettled) == len(end.chunk.folders):
+                unseen += [(job, end) for job in unsettled]
         self._judge_unseen(unseen)
         return True
 
@@ -158,16 +158,15 @@ class Flying:
 
     def _end_early(self, end: ChunkEnd) -> None:
         """Settles what a process left behind that did not come to the end."""
-        left = [
+        lost_jobs = [
             job
             for job in self._unsettled(end.chunk)
             if job.folder.state is not RunState.RUNNING
         ]
-        begun = [job for job in left if self._begun_now(job)]
-        concerned = begun or left
-        if end.cause in _OF_THE_WHOLE_CHUNK:
-            concerned = left
-        for job in concerned:
+        if end.cause not in _OF_THE_WHOLE_CHUNK:
+            # Where it began none, it died on its way to the first one: all count.
+            lost_jobs = [*filter(self._begun_now, lost_jobs)] or lost_jobs
+        for job in lost_jobs:
             self._lose(job, end)
 
     def _begun_now(self, job: Job) -> bool:

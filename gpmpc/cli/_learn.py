@@ -16,7 +16,7 @@ from gpmpc import logs
 from gpmpc._files import write_whole
 from gpmpc._provenance import code_fingerprint, provenance
 from gpmpc.cli._commands import Result
-from gpmpc.cli._settings import find_modules_here, write_files, writing
+from gpmpc.cli._folders import find_modules_here, write_files, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.logs import IdentifiedModel, Judgement, Log
 from gpmpc.plotting import judgement_figure, png

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from gpmpc._files import write_whole
 from gpmpc.cli._commands import Result
-from gpmpc.cli._settings import writing
+from gpmpc.cli._folders import writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.recording import Run, layout, read_run, recover

@@ -3,7 +3,7 @@
     words -> flags of all commands -> command -> parsed arguments -> settings ->
     function
 
-A user's mistake is one line and exit code 2.
+A user's mistake is one line and exit code 2. Hydra is loaded for what needs it alone.
 """
 
 import argparse
@@ -13,19 +13,9 @@ from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
-from omegaconf import OmegaConf
-
 from gpmpc.cli._commands import COMMANDS, FLAGS, Result, Subcommand
-from gpmpc.cli._settings import (
-    compose,
-    explain,
-    find_modules_here,
-    help_text,
-    model_file,
-    nearest,
-    settings,
-    working_folder,
-)
+from gpmpc.cli._folders import find_modules_here, working_folder
+from gpmpc.cli._spelling import nearest
 from gpmpc.cli._terminal import print_error, redirected_output
 from gpmpc.exceptions import GpmpcError
 from gpmpc.parallel import THREADS
@@ -73,6 +63,8 @@ def _run(words: Sequence[str], debug: bool) -> Result:
     except Exception as error:
         if debug:
             raise
+        from gpmpc.cli._mistakes import explain
+
         has_settings = command is not None and command.has_settings
         message = explain(error, name if has_settings else "")
         if message is None:
@@ -116,6 +108,10 @@ def _run_with_settings(
     name: str, command: Subcommand, arguments: argparse.Namespace
 ) -> Result:
     """Composes the settings, and shows them or runs the command with them."""
+    from omegaconf import OmegaConf
+
+    from gpmpc.cli._settings import compose, help_text, model_file, settings
+
     arguments.config_name = arguments.config_name or name
     arguments.overrides = [
         override for word in arguments.overrides for override in model_file(word)

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from gpmpc.cli._commands import Result
-from gpmpc.cli._settings import write_files
+from gpmpc.cli._folders import write_files
 from gpmpc.exceptions import SettingError
 
 # Files, named and written for a system called NAME.

@@ -10,9 +10,9 @@ from typing import Any
 from rich.console import Console
 
 from gpmpc.cli._commands import Result
+from gpmpc.cli._folders import writing
 from gpmpc.cli._log import condition
 from gpmpc.cli._recorded import experiment_of_run, recordings
-from gpmpc.cli._settings import writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, RecordingError
 from gpmpc.plotting import (

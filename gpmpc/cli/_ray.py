@@ -9,8 +9,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from gpmpc.cli._folders import find_modules_here
 from gpmpc.cli._launchers import Cause, Chunk, ChunkEnd, Work
-from gpmpc.cli._settings import find_modules_here
 from gpmpc.exceptions import GpmpcError, SettingError
 
 _CAUSES = {

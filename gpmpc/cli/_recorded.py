@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gpmpc._trust import trusted_packages
+from gpmpc.cli._folders import find_modules_here
+from gpmpc.cli._mistakes import one_line
 from gpmpc.cli._recorded_settings import read_settings
-from gpmpc.cli._settings import find_modules_here, one_line
 from gpmpc.exceptions import DataError
 from gpmpc.recording import Run
 from gpmpc.studies._run_folder import RECORDING

@@ -5,7 +5,7 @@ import argparse
 from rich.console import Console
 
 from gpmpc.cli._commands import Result
-from gpmpc.cli._settings import write_files
+from gpmpc.cli._folders import write_files
 from gpmpc.studies._document import terminal
 from gpmpc.studies.report import (
     compare,

@@ -397,7 +397,8 @@ def _sbatch(options: Sequence[str], script: str, name: str) -> str:
     Raises:
         GpmpcError: Slurm refuses it, or stays busy.
     """
-    for wait in (*_WAITS, None):
+    waits = iter(_WAITS)
+    while True:
         answer = _run(["sbatch", "--parsable", *options], script=script)
         if answer.returncode == 0:
             return answer.stdout.strip()
@@ -405,20 +406,20 @@ def _sbatch(options: Sequence[str], script: str, name: str) -> str:
         numbers = [job.number for (array, _), job in jobs.items() if array == name]
         if numbers:
             return numbers[0].partition("_")[0]
+        wait = next(waits, None)
         if wait is None or not _BUSY.search(answer.stderr):
-            break
+            raise GpmpcError(f"Slurm refuses the sweep: {_one_line(answer.stderr)}")
         time.sleep(wait)
-    raise GpmpcError(f"Slurm refuses the sweep: {_one_line(answer.stderr)}")
 
 
 def _queue() -> dict[tuple[str, int], _Job] | None:
     """Returns this user's jobs by array's name and index; None if Slurm is silent."""
     command = ["squeue", "--me", "--array", "--noheader", "--states=all"]
-    listed = _run([*command, f"--format={_FORMAT}"])
-    if listed.returncode:
+    answer = _run([*command, f"--format={_FORMAT}"])
+    if answer.returncode:
         return None
     jobs = {}
-    for line in listed.stdout.splitlines():
+    for line in answer.stdout.splitlines():
         name, index, *job = line.split("|")
         if name.startswith(_PREFIX) and index.isdecimal() and len(job) == 4:
             jobs[name, int(index)] = _Job(*job)
@@ -430,11 +431,11 @@ def _accounted(name: str) -> dict[int, _Job]:
     if shutil.which("sacct") is None:
         return {}
     command = ["sacct", "--noheader", "--allocations", "--parsable2", f"--name={name}"]
-    listed = _run([*command, "--format=JobID,State,NodeList"])
-    if listed.returncode:
+    answer = _run([*command, "--format=JobID,State,NodeList"])
+    if answer.returncode:
         return {}
     jobs = {}
-    for line in listed.stdout.splitlines():
+    for line in answer.stdout.splitlines():
         number, state, host = line.split("|")
         index = number.rpartition("_")[2]
         state = state.partition(" ")[0]  # of "CANCELLED by 1000"

@@ -6,7 +6,7 @@ import sys
 import traceback
 from pathlib import Path
 
-from gpmpc.cli._settings import find_modules_here
+from gpmpc.cli._folders import find_modules_here
 from gpmpc.cli._slurm import CHUNKS, DONE
 from gpmpc.cli._terminal import print_error
 

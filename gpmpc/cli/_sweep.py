@@ -16,7 +16,7 @@ import itertools
 import json
 from argparse import Namespace
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,9 +31,9 @@ from gpmpc.cli._composing import Composer
 from gpmpc.cli._examples import Examples
 from gpmpc.cli._experiment import experiment_of, plain_settings
 from gpmpc.cli._flying import Flying
+from gpmpc.cli._folders import folder_of, write_files
 from gpmpc.cli._launchers import launcher_of
 from gpmpc.cli._overrides import choices, combinations
-from gpmpc.cli._settings import folder_of, write_files
 from gpmpc.cli._terminal import print_error, progress_bar
 from gpmpc.exceptions import check_number
 from gpmpc.studies._index import RunIndex
@@ -131,9 +131,10 @@ class Sweep:
         """Compares a run's settings, once: the index says with what it was compared."""
         fingerprint = job.settings.fingerprint()
         path = job.folder.path / METRICS
-        fingerprint_then, record = self._index.asked(path)
-        is_same = fingerprint is not None and fingerprint == fingerprint_then
-        if record is not None and is_same:
+        record = None
+        if fingerprint is not None:
+            record = self._index.record_with(path, fingerprint)
+        if record is not None:
             warning = record.warning
             other_code = "" if record.is_of_this_code() else record.made_by
         else:
@@ -147,10 +148,10 @@ class Sweep:
         if other_code:
             self.of_other_code[job.folder.path] = other_code
 
-    def _add_to_index(self, path: Path, result: Any, asked: str | None) -> None:
+    def _add_to_index(self, path: Path, result: Any, fingerprint: str | None) -> None:
         """Keeps what a report shows of a run, unless it is of an older version."""
         with suppress(*DAMAGE):
-            self._index.add(path, result, asked)
+            self._index.add(path, result, fingerprint)
 
     def fly(self, jobs: Sequence[Job]) -> list[JobOutcome]:
         """Flies the runs that are not finished; returns the outcome of each of those.
@@ -291,35 +292,19 @@ def sweep(arguments: Namespace) -> Result:
     every_run = combinations(arguments.overrides)
     first = next(every_run)
     with closing(Sweep(arguments.config_name, first, console)) as runs:
-        by_folder = {
-            job.folder.path: job
-            for job in map(runs.job, itertools.chain([first], every_run))
-        }
-        jobs = list(by_folder.values())
-        finished = sum(job.folder.finished for job in jobs)
+        jobs = _distinct(map(runs.job, itertools.chain([first], every_run)))
+        finished_before = sum(job.folder.finished for job in jobs)
         runs.check(jobs)
         _write_plan(runs.tree, jobs)
         with runs.progress(jobs, len(jobs)):
             outcomes = runs.fly(jobs)
-    # What is there counts: another sweep may have flown what failed in this one.
-    there = {job.folder.path for job in jobs if job.folder.finished}
-    failed = [
-        outcome
-        for outcome in outcomes
-        if outcome.error is not None and Path(outcome.folder) not in there
-    ]
-    total = "1 run" if len(jobs) == 1 else f"{len(jobs)} runs"
-    gone = len(jobs) - len(there) - len(failed)
-    console.out(
-        f"{total}: {len(there) - finished} flown, {finished} finished before, "
-        f"{len(failed)} failed{f', {gone} gone' if gone else ''}"
-        f"{_count_warnings(runs.warnings)}; in {runs.tree}",
-        highlight=False,
-    )
+    end = _end_of(jobs, outcomes, finished_before)
+    text = f"{end.line()}{_count_warnings(runs.warnings)}; in {runs.tree}"
+    console.out(text, highlight=False)
     runs.print_other_code()
     runs.print_attempts()
     runs.print_warnings()
-    for outcome in failed:
+    for outcome in end.failed:
         print_error(f"failed: {outcome.folder}: {outcome.error}")
     data = {
         "folder": str(runs.tree),
@@ -327,10 +312,59 @@ def sweep(arguments: Namespace) -> Result:
         "of_other_code": [str(path) for path in runs.of_other_code],
         "warnings": {str(path): text for path, text in runs.warnings.items()},
         "failed": [
-            {"folder": outcome.folder, "error": outcome.error} for outcome in failed
+            {"folder": outcome.folder, "error": outcome.error} for outcome in end.failed
         ],
     }
-    return Result(data, 1 if failed or gone else 0)
+    return Result(data, 1 if end.failed or end.gone else 0)
+
+
+def _distinct(jobs: Iterable[Job]) -> list[Job]:
+    """Returns the jobs, of those with the same folder the last one."""
+    by_folder = {job.folder.path: job for job in jobs}
+    return [*by_folder.values()]
+
+
+class _SweepEnd(NamedTuple):
+    """How the runs of a sweep ended."""
+
+    total: int
+    finished_before: int
+    flown: int
+    failed: list[JobOutcome]
+
+    @property
+    def gone(self) -> int:
+        """Number of runs that ended, and whose folders are not there any more."""
+        return self.total - self.finished_before - self.flown - len(self.failed)
+
+    def line(self) -> str:
+        """Returns the counts in words."""
+        runs = "1 run" if self.total == 1 else f"{self.total} runs"
+        text = (
+            f"{runs}: {self.flown} flown, {self.finished_before} finished before, "
+            f"{len(self.failed)} failed"
+        )
+        if self.gone:
+            text += f", {self.gone} gone"
+        return text
+
+
+def _end_of(
+    jobs: Sequence[Job], outcomes: Sequence[JobOutcome], finished_before: int
+) -> _SweepEnd:
+    """Counts what is there: another sweep may have flown what failed in this one."""
+    finished = {job.folder.path for job in jobs if job.folder.finished}
+    failed = [
+        outcome
+        for outcome in outcomes
+        if outcome.error is not None and Path(outcome.folder) not in finished
+    ]
+    return _SweepEnd(
+        total=len(jobs),
+        finished_before=finished_before,
+        flown=len(finished) - finished_before,
+        failed=failed,
+    )
 
 
 def _write_plan(tree: Path, jobs: Sequence[Job]) -> None:

@@ -115,9 +115,9 @@ def logging_console() -> "Console":
 
     def is_new(record: logging.LogRecord) -> bool:
         text = record.getMessage()
-        known = len(shown)
+        is_repeated = text in shown
         shown.add(text)
-        return len(shown) > known and record.name != _SEARCH
+        return not is_repeated and record.name != _SEARCH
 
     handler = RichHandler(
         console=console, show_path=False, show_time=False, show_level=False

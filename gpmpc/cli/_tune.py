@@ -22,8 +22,9 @@ from rich.console import Console
 from gpmpc.cli._chunks import Job
 from gpmpc.cli._commands import Result
 from gpmpc.cli._experiment import experiment_of
+from gpmpc.cli._folders import write_files
 from gpmpc.cli._overrides import choices
-from gpmpc.cli._settings import without_hydra, write_files
+from gpmpc.cli._settings import without_hydra
 from gpmpc.cli._sweep import Sweep
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, check_number
 from gpmpc.metrics import tracking_cost

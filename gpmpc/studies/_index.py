@@ -48,8 +48,8 @@ class _Line:
     written: int
     size: int
     record: RunRecord
-    #: fingerprint of the settings that a sweep asked for, and that the run has
-    asked: str | None
+    #: of the settings that a sweep asked for, and that the run has
+    fingerprint: str | None
 
 
 class RunIndex:
@@ -82,14 +82,14 @@ class RunIndex:
         return self.add(path)
 
     def add(
-        self, path: Path, content: Any = None, asked: str | None = None
+        self, path: Path, content: Any = None, fingerprint: str | None = None
     ) -> RunRecord:
         """Adds a run; ``write`` puts it into the file, or one that follows does.
 
         Args:
             path: Its ``metrics.json`` or ``error.json``.
             content: Of the file; None reads it.
-            asked: Fingerprint of the settings that it was compared with.
+            fingerprint: Of the settings that it was compared with.
 
         Raises:
             DAMAGE: The file is none that a run writes.
@@ -98,7 +98,13 @@ class RunIndex:
         if content is None:
             content = json.loads(path.read_text(encoding="utf-8"))
         record = self._compact(read_record(path, content))
-        line = _Line(path.name, status.st_mtime_ns, status.st_size, record, asked)
+        line = _Line(
+            file=path.name,
+            written=status.st_mtime_ns,
+            size=status.st_size,
+            record=record,
+            fingerprint=fingerprint,
+        )
         self._lines[path.parent.name] = line
         base = self._base_of_keys[tuple(record.settings)]
         if base not in self._written_bases:
@@ -110,10 +116,12 @@ class RunIndex:
             self.write()
         return record
 
-    def asked(self, path: Path) -> tuple[str | None, RunRecord | None]:
-        """Returns which settings a run was last found to have, and the run."""
+    def record_with(self, path: Path, fingerprint: str) -> RunRecord | None:
+        """Returns a run that was found to have the settings of a fingerprint."""
         line = self._valid_line(path)
-        return (None, None) if line is None else (line.asked, line.record)
+        if line is None or line.fingerprint != fingerprint:
+            return None
+        return line.record
 
     def write(self) -> None:
         """Appends what was added; where that is not possible, nothing is lost."""
@@ -183,7 +191,7 @@ class RunIndex:
             written=int(content["written"]),
             size=int(content["size"]),
             record=record,
-            asked=content["asked"],
+            fingerprint=content["fingerprint"],
         )
 
     def _compact(self, record: RunRecord) -> RunRecord:
@@ -224,7 +232,7 @@ def _content(name: str, base: str, line: _Line) -> dict[str, Any]:
         "file": line.file,
         "written": line.written,
         "size": line.size,
-        "asked": line.asked,
+        "fingerprint": line.fingerprint,
         "base": base,
         "changes": record.settings.changes,
         "choices": record.choices,

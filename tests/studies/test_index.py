@@ -127,14 +127,14 @@ def test_two_writers_add_their_lines(tree):
     one, two = RunIndex(tree), RunIndex(tree)
     paths = sorted(tree.glob("*/metrics.json"))
     for index, path in zip((one, two, one, two), paths, strict=False):
-        index.add(path, asked="x")
+        index.add(path, fingerprint="x")
         index.write()
     third = RunIndex(tree)
     for path in paths[:4]:
-        asked, record = third.asked(path)
-        assert asked == "x"
+        record = third.record_with(path, "x")
         assert record.folder == path.parent
-    assert third.asked(paths[4]) == (None, None)
+    assert third.record_with(paths[3], "y") is None
+    assert third.record_with(paths[4], "x") is None
 
 
 def test_runs_below_several_folders_have_an_index_each(tree, reads):
