@@ -15,19 +15,34 @@ import random
 import statistics
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 FLIGHT = ["system=double_integrator", "steps=2", "recorder=none"]
 SEEDS = 10  # of every combination of settings
 
 
-def gpmpc(*words: str) -> tuple[str, float, float]:
-    """Runs the command; returns what it printed, time [s] and most memory [MB]."""
+class Memory(NamedTuple):
+    """What a process held at a time."""
+
+    time: float  # since the epoch [s]
+    megabytes: float
+
+
+def gpmpc(*words: str, memory: list[Memory] | None = None) -> tuple[str, float, float]:
+    """Runs the command; returns what it printed, time [s] and most memory [MB].
+
+    ``memory`` takes what it holds, every half second.
+    """
     command = [sys.executable, "-c", "from gpmpc.cli import main; main()", *words]
     start = time.perf_counter()
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
+        if memory is not None:
+            watch = threading.Thread(target=_watch, args=(process.pid, memory))
+            watch.start()
         output = process.stdout.read()
         _, status, usage = os.wait4(process.pid, 0)
         process.returncode = os.waitstatus_to_exitcode(status)
@@ -37,6 +52,21 @@ def gpmpc(*words: str) -> tuple[str, float, float]:
     if process.returncode:
         raise SystemExit(f"gpmpc {' '.join(words)}: exit code {process.returncode}")
     return output, seconds, usage.ru_maxrss / 1024
+
+
+def _watch(process: int, memory: list[Memory]) -> None:
+    """Notes the memory of a process until it ends."""
+    page = os.sysconf("SC_PAGE_SIZE")
+    status = Path(f"/proc/{process}/statm")
+    while True:
+        try:
+            pages = int(status.read_text().split()[1])
+        except (OSError, IndexError):
+            return
+        if pages == 0:  # it has ended
+            return
+        memory.append(Memory(time.time(), 1e-6 * pages * page))
+        time.sleep(0.5)
 
 
 def make(folder: Path, count: int) -> None:
@@ -69,19 +99,28 @@ def fly(folder: Path, count: int) -> None:
     """Flies ``count`` short runs by joblib, and says what they cost beside flying."""
     words = ["run", "-m", *FLIGHT, f"seed=range({count})", f"folder={folder}"]
     words += ["launcher=joblib", "hydra.launcher.n_jobs=2"]
-    output, seconds, memory = gpmpc(*words)
+    print(f"load before it: {os.getloadavg()[0]:.1f}")
+    memory: list[Memory] = []
+    output, seconds, _ = gpmpc(*words, memory=memory)
     print(output.splitlines()[-1])
     begun = [path.stat().st_mtime for path in folder.glob("*/config.yaml")]
     ended = [path.stat().st_mtime for path in folder.glob("*/metrics.json")]
     print(
         f"{seconds:.1f} s in all, {seconds - (max(ended) - min(begun)):.1f} s of them"
     )
-    print(f"before the first run and behind the last; {memory:.0f} MB in the driver")
+    print("before the first run and behind the last")
+    flying = [each for each in memory if min(begun) <= each.time <= max(ended)]
+    megabytes = [each.megabytes for each in flying]
+    print(
+        f"driver: {megabytes[0]:.0f} MB when the first run began, "
+        f"{min(megabytes):.0f} to {max(megabytes):.0f} MB from then on"
+    )
     print(f"{1e3 * (max(ended) - min(begun)) / count:.0f} ms a run, two processes")
     flights = [_flight(path) for path in folder.glob("*/metrics.json")]
     print(
         f"{1e3 * statistics.median(flights):.0f} ms of training and decisions in each"
     )
+    print(f"load: {os.getloadavg()[0]:.1f}")
     _, seconds, _ = gpmpc(*words)
     print(f"{seconds:.1f} s to find all of it finished")
 
@@ -103,7 +142,8 @@ def read(folder: Path) -> None:
         ("report", ["report", str(tree)]),
     ):
         _, seconds, memory = gpmpc(*words)
-        print(f"{title}: {seconds:.1f} s, {memory:.0f} MB")
+        load = os.getloadavg()[0]
+        print(f"{title}: {seconds:.1f} s, {memory:.0f} MB; load {load:.1f}")
 
 
 def main() -> None:

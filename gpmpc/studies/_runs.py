@@ -10,11 +10,11 @@ and a run that cannot give them is skipped, with the reason.
 import json
 import os
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pandas as pd
 
@@ -65,7 +65,7 @@ class Report:
     skipped: tuple[str, ...] = ()
 
     @cached_property
-    def there(self) -> list[Any]:
+    def ended(self) -> list[Any]:
         """Every run that finished or failed; columns are attributes."""
         return [*self.runs[self.runs.folder.notna()].itertuples()]
 
@@ -85,7 +85,7 @@ class Report:
 
     def base_settings(self) -> list[str]:
         """Returns the settings that all runs share, one ``key: value`` each."""
-        first, *others = (run.settings for run in self.there)
+        first, *others = (run.settings for run in self.ended)
         shared = dict(first)
         for settings in others:
             keys = [*shared]
@@ -216,11 +216,11 @@ def _why_skipped(path: Path, writer: str, error: Exception) -> str:
 
 def _not_there(files: _Files) -> list[RunRecord]:
     """Returns the runs that were planned and are missing or cannot be read."""
-    there = {_name_of(run.choices) for run in files.runs}
+    names = {_name_of(run.choices) for run in files.runs}
     absent = []
     for choices in files.plans:
         name = _name_of(choices)
-        if name not in there:
+        if name not in names:
             state = "skipped" if name in files.unread_folders else "missing"
             absent.append(RunRecord(choices, state))
     return absent
@@ -236,43 +236,64 @@ def _put_together(
 ) -> Report:
     """Finds what was varied, and sorts the runs by cell and seed."""
     all_choices = _completed_choices(runs)
+    values = _values_by_setting(all_choices)
+    variables = tuple(sorted(key for key in values if len(values[key]) > 1))
+    constants: Choices = {}
+    for key in values:
+        if key not in variables:
+            (constants[key],) = values[key]
+    by_place: dict[_Place, RunRecord] = {}
+    for choices, run in zip(all_choices, runs, strict=True):
+        cell = tuple(choices[key] for key in variables)
+        place = _Place(cell, choices[SEED])
+        if run.state == "finished" or place not in by_place:
+            by_place[place] = run
+    cells = tuple(sorted({place.cell for place in by_place}, key=_values_in_order))
+    return Report(
+        tree=tree,
+        variables=variables,
+        constants={k: v for k, v in constants.items() if v != _DEFAULT},
+        cells=cells,
+        runs=_table_of(by_place, cells),
+        skipped=tuple(skipped),
+    )
+
+
+class _Place(NamedTuple):
+    """Where a run stands in a report."""
+
+    #: values of the variables
+    cell: tuple[str, ...]
+    seed: str
+
+
+def _values_by_setting(all_choices: Iterable[Choices]) -> dict[str, set[str]]:
+    """Returns the values that runs chose of each setting but the seed."""
     values: dict[str, set[str]] = {}
     for choices in all_choices:
         for key, value in choices.items():
             values.setdefault(key, set()).add(value)
     del values[SEED]
-    variables = tuple(sorted(key for key in values if len(values[key]) > 1))
-    constants: Choices = {}
-    for key in values:
-        if len(values[key]) == 1:
-            (constants[key],) = values[key]
-    constants = {key: value for key, value in constants.items() if value != _DEFAULT}
+    return values
 
-    by_place: dict[tuple[tuple[str, ...], str], RunRecord] = {}
-    for choices, run in zip(all_choices, runs, strict=True):
-        cell = tuple(choices[key] for key in variables)
-        place = (cell, choices[SEED])
-        if run.state == "finished" or place not in by_place:
-            by_place[place] = run
-    cells = tuple(sorted({cell for cell, _ in by_place}, key=_values_in_order))
+
+def _table_of(
+    by_place: Mapping[_Place, RunRecord], cells: Sequence[tuple[str, ...]]
+) -> pd.DataFrame:
+    """Returns a row for every run, cell by cell and seed by seed."""
     position = {cell: i for i, cell in enumerate(cells)}
     places = sorted(
-        by_place, key=lambda place: (position[place[0]], in_order(place[1]))
+        by_place, key=lambda place: (position[place.cell], in_order(place.seed))
     )
     columns: dict[str, list[Any]] = {}
-    for cell, seed in places:
-        row = by_place[cell, seed].row() | {"cell": position[cell], "seed": seed}
+    for place in places:
+        row = by_place[place].row()
+        row["cell"] = position[place.cell]
+        row["seed"] = place.seed
         for name, value in row.items():
             columns.setdefault(name, []).append(value)
     types = dict.fromkeys(MEASURES, float) | {"cell": int}
-    return Report(
-        tree=tree,
-        variables=variables,
-        constants=constants,
-        cells=cells,
-        runs=pd.DataFrame(columns, dtype=object).astype(types),
-        skipped=tuple(skipped),
-    )
+    return pd.DataFrame(columns, dtype=object).astype(types)
 
 
 def _completed_choices(runs: Sequence[RunRecord]) -> list[Choices]:

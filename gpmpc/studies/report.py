@@ -107,7 +107,7 @@ def terminal_table(report: Report) -> Table:
 def notes(report: Report) -> dict[str, list[str]]:
     """Returns what has to be known of runs, by kind: their folders and the reasons."""
     reasons: dict[str, list[str]] = {"Failed": [], "Lost": [], "Suspicious": []}
-    for run in report.there:
+    for run in report.ended:
         folder = plain_text(run.folder.name)
         if run.error:
             reasons["Failed"].append(f"{folder}: {run.error}")
@@ -125,7 +125,7 @@ def _mixed_code(report: Report) -> list[str]:
     counts: dict[str, int] = {}
     commits: dict[str, str] = {}
     dates: dict[str, str] = {}
-    for run in report.there:
+    for run in report.ended:
         if run.state != "finished":
             continue
         counts[run.code] = counts.get(run.code, 0) + 1
@@ -166,18 +166,18 @@ def _origin(report: Report) -> list[str]:
 
 def _origins(report: Report, key: str) -> list[str]:
     """Returns what the runs tell of their origin under a key, each once and sorted."""
-    return sorted({run.origin[key] for run in report.there if key in run.origin})
+    return sorted({run.origin[key] for run in report.ended if key in run.origin})
 
 
 def _links(report: Report, folder: Path) -> dict[str, str]:
     """Returns the runs as seen from ``folder``, by their name in the tree."""
-    parents = {run.folder.parent for run in report.there}
+    parents = {run.folder.parent for run in report.ended}
     seen = {each: os.path.relpath(each.resolve(), folder) for each in parents}
     return {
         plain_text(str(run.folder.relative_to(report.tree))): os.path.join(
             seen[run.folder.parent], run.folder.name
         )
-        for run in report.there
+        for run in report.ended
     }
 
 

@@ -415,7 +415,7 @@ def test_a_page_says_what_made_the_runs_and_links_them(tree):
     report = read_report(tree)
     html = documents(report)["report.html"]
     links = re.findall(r'href="([^"]*)"', html)
-    assert len(links) == len(report.there) == 16
+    assert len(links) == len(report.ended) == 16
     assert all((tree / "report" / unquote(link)).resolve().is_dir() for link in links)
     provenance = record_of({})["provenance"]
     for text in (

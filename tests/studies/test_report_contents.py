@@ -364,7 +364,7 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
         f"gpmpc run -m horizon=10 controller=lqr seed=1,3 folder={tree}\n```\n\n"
         "## Settings of all runs\n\n```\ndata.size: null\nhorizon: 10\n```\n"
     )
-    origins = [run.origin for run in report.there]
+    origins = [run.origin for run in report.ended]
     dates = sorted({origin["date"] for origin in origins})
     lines = [line.removeprefix("- ") for line in made.splitlines()]
     assert lines[0] == "Runs made: " + " to ".join(dict.fromkeys([dates[0], dates[-1]]))
@@ -433,7 +433,7 @@ def test_where_a_run_comes_from_is_told_as_far_as_it_says_so(
     made_up_run(
         tmp_path, *chosen("lqr", 0), result=metrics_of(0.1) | {"provenance": provenance}
     )
-    (run,) = read_report(tmp_path).there
+    (run,) = read_report(tmp_path).ended
     assert run.origin == origin
 
 
