@@ -46,6 +46,16 @@ def measured_dim(model: Any) -> int:
     return getattr(model, "measured_dim", model.state_dim)
 
 
+def weighed_dim(model: DynamicsModel, problem: Any) -> int:
+    """Returns the number of states that a controller's problem is to weigh.
+
+    They are all of the model's, or those that are measured where it weighs as many.
+    """
+    measured = measured_dim(model)
+    weighs_measured = getattr(problem, "state_dim", None) == measured
+    return measured if weighs_measured else model.state_dim
+
+
 def has_past(model: Any) -> TypeGuard[ModelWithPast]:
     """Returns whether a model's state holds more than what is measured."""
     measured = getattr(model, "measured_dim", None)

@@ -46,7 +46,7 @@ from gpmpc._kernels.linalg import copy_matrix, dot, product
 from gpmpc.exceptions import SettingError, check_choice, check_number
 from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
 from gpmpc.models import RollOut
-from gpmpc.models._past import measured_dim
+from gpmpc.models._past import weighed_dim
 from gpmpc.mpc._constraints import ConstraintRows, largest_violation
 from gpmpc.mpc._controller import Decision, Request, check_controller, check_method
 from gpmpc.mpc._cost import PENALIZED, by_stage
@@ -182,9 +182,7 @@ class PredictionModel:
         settings: PredictionSettings,
     ):
         states, inputs = check_next_states(model)
-        weighed = states
-        if getattr(problem, "state_dim", states) == measured_dim(model):
-            weighed = measured_dim(model)
+        weighed = weighed_dim(model, problem)
         names = signals_of(model).input_names
         self.initial_input = check_controller(
             problem, weighed, inputs, horizon, initial_input, names

@@ -14,6 +14,7 @@ from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, check_next_states
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
+from gpmpc.models._past import weighed_dim
 from gpmpc.mpc._controller import (
     Decision,
     Reference,
@@ -59,10 +60,10 @@ class LQR:
         initial_input: Sequence[float],
     ):
         self.signals = signals_of(model)
-        states, inputs = check_next_states(model)
+        _, inputs = check_next_states(model)
         self.initial_input = check_controller(
             problem,
-            states=states,
+            states=weighed_dim(model, problem),
             inputs=inputs,
             horizon=horizon,
             initial_input=initial_input,
@@ -75,11 +76,11 @@ class LQR:
                 "LQR knows the bounds of inputs only; leave those of states out",
             )
         self.model = model
-        problem = problem.with_angles(angles_of(model))
-        self.problem = problem
+        self.problem = problem.with_angles(angles_of(model))
+        self._whole_problem = self.problem.over(model.state_dim)
         self.horizon = horizon
         self._linearize = StageLinearizer(model, Linearization(), "none")
-        self._cost = StageCosts(problem, horizon, self._linearize).quadratic
+        self._cost = StageCosts(self._whole_problem, horizon, self._linearize).quadratic
 
     def control(
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None
@@ -90,7 +91,7 @@ class LQR:
         """
         start = perf_counter()
         request = Request.read(
-            self.problem,
+            self._whole_problem,
             self.horizon,
             self.initial_input,
             belief,

@@ -94,11 +94,11 @@ class StateFormMPC:
             model, propagator, problem, horizon, initial_input, prediction
         )
         self.initial_input = self.prediction.initial_input
-        problem = self.problem = self.prediction.problem
+        self.problem = self.prediction.stated_problem
         self.horizon = horizon
         self.solver = solver
         self.options = TIGHT.get(solver, {}) if options is None else options
-        problem.check_plain("StateFormMPC")
+        self.problem.check_plain("StateFormMPC")
         self.signals = self.prediction.signals
         self._program = _StateFormProgram(self.prediction, constraints)
 
