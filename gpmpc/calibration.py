@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from gpmpc._angles import angles_of, whole_turns
 from gpmpc._arrays import read_array
@@ -50,6 +51,7 @@ from gpmpc.metrics import (
     mean_squared_error,
     negative_log_predictive_density,
 )
+from gpmpc.models._past import has_past, measured_dim, states_along
 from gpmpc.propagation import Propagator, best_propagator
 from gpmpc.signals import UNKNOWN, Signals, signals_of
 
@@ -291,7 +293,7 @@ def _assumed_noise(
     measurement_noise: Sequence[float] | None,
 ) -> _Noise:
     """Returns the noise of predictions; see ``calibrate``."""
-    n = model.state_dim
+    n = measured_dim(model)
     moves_state = bool(getattr(propagator, "process_noise", False))
     sensors = torch.zeros(n, dtype=model.dtype, device=model.device)
     if measurement_noise is not None:
@@ -302,7 +304,7 @@ def _assumed_noise(
         ).square()
     last = sensors
     if not moves_state and measurement_noise is None:
-        last = model.noise_covariance.diagonal()
+        last = model.noise_covariance.diagonal()[:n]
     return _Noise(moves_state=moves_state, start=torch.diag(sensors), last=last)
 
 
@@ -319,21 +321,26 @@ def _predict_recording(
     Yields:
         The number of steps ahead, less one, and predictions of as many steps.
     """
-    n = model.state_dim
+    n = measured_dim(model)
     size = len(recording)
     states = recording.states.to(dtype=model.dtype, device=model.device)
     inputs = recording.inputs.to(dtype=model.dtype, device=model.device)
+    if has_past(model):
+        whole = states_along(model, states.numpy(), inputs.numpy())
+        states = torch.from_numpy(whole)
+    further = states.shape[1] - n
+    start = pad(noise.start, (0, further, 0, further))
     for first in range(0, size, CHUNK):
         mean = states[first : min(first + CHUNK, size)]
-        belief = Gaussian(mean, noise.start.expand(len(mean), n, n))
+        belief = Gaussian(mean, start.expand(len(mean), *start.shape))
         for k in range(min(horizon, size - first)):
             # From here on k + 1 steps would outlast the recording.
             last = min(first + CHUNK, size - k)
             count = last - first
             belief = Gaussian(belief.mean[:count], belief.covariance[:count])
             belief = propagator(model, belief, inputs[first + k : last + k])
-            mean = belief.mean.double().cpu()
-            variance = (belief.variance + noise.last).double().cpu()
+            mean = belief.mean[:, :n].double().cpu()
+            variance = (belief.variance[:, :n] + noise.last).double().cpu()
             observed = recording.states[first + k + 1 : last + k + 1].clone()
             observed[:, angles] -= whole_turns((observed - mean)[:, angles])
             yield k, _Predictions(mean=mean, variance=variance, observed=observed)
@@ -377,7 +384,7 @@ def _state_names(
     known = signals_of(model).state_names
     if not known and recordings:
         known = recordings[0].signals.state_names
-    return tuple(known) or tuple(f"x{i + 1}" for i in range(model.state_dim))
+    return tuple(known) or tuple(f"x{i + 1}" for i in range(measured_dim(model)))
 
 
 def _noise_in_words(moves_the_state: bool, sensors_known: bool) -> str:
@@ -399,12 +406,11 @@ def _check(
     names: tuple[str, ...],
 ) -> None:
     """Raises unless model, recordings, levels and names belong together."""
-    n = model.state_dim
+    n = measured_dim(model)
     m = model.input_dim
-    if model.output_dim != n:
-        raise ShapeError(
-            f"the model must predict its {n} states; it has {model.output_dim} outputs"
-        )
+    if model.output_dim != model.state_dim:
+        rule = f"the model must predict its {model.state_dim} states"
+        raise ShapeError(f"{rule}; it has {model.output_dim} outputs")
     sizes = {(r.states.shape[1], r.inputs.shape[1]) for r in recordings}
     if sizes != {(n, m)}:
         raise ShapeError(

@@ -23,6 +23,7 @@ from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models._log_linearization import DIFFERENCE, LogLinearizer
 from gpmpc.models._log_model import LogModel
+from gpmpc.models._past import states_along
 from gpmpc.signals import UNKNOWN, Signals
 
 #: of the coloured noise of outputs [s]; zero is white
@@ -136,11 +137,9 @@ class LogDynamics:
         if not count or (states.shape, inputs.shape) != shapes:
             rule = "states (P + 1, n) and inputs (P, m) must be rows of one flight"
             raise ShapeError(f"{rule}; got {states.shape} and {inputs.shape}")
-        first_input = inputs[0] if len(inputs) else np.zeros(self.input_dim)
-        state = self.at_rest(states[0], first_input)
-        for input, measured in zip(inputs, states[1:], strict=True):
-            state = self.follow(state, input, measured)
-        return state
+        if not len(inputs):
+            inputs = np.zeros((1, self.input_dim))
+        return states_along(self, states, inputs)[-1]
 
     @property
     def angles(self) -> Sequence[int]:

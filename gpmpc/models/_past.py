@@ -7,6 +7,7 @@ from step to step by ``at_rest``, where a flight begins, and ``follow``.
 
 from typing import Any, Protocol, TypeGuard
 
+import numpy as np
 import torch
 
 from gpmpc._dynamics import Array, DynamicsModel
@@ -60,6 +61,22 @@ def has_past(model: Any) -> TypeGuard[ModelWithPast]:
     """Returns whether a model's state holds more than what is measured."""
     measured = getattr(model, "measured_dim", None)
     return measured is not None and measured < model.state_dim
+
+
+def states_along(model: ModelWithPast, measured: Array, inputs: Array) -> Array:
+    """Returns the states (T, n) along the rows of a flight, from rest at the first one.
+
+    Args:
+        model: With a past.
+        measured: (T, measured_dim).
+        inputs: Each applied from the time of its row on (T - 1 or T, m).
+    """
+    state = model.at_rest(measured[0], inputs[0])
+    states = [state]
+    for input, after in zip(inputs, measured[1:], strict=False):
+        state = model.follow(state, input, after)
+        states.append(state)
+    return np.array(states)
 
 
 def belief_of_all(belief: Gaussian, state: Array) -> Gaussian:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from gpmpc.calibration import Recording, calibrate
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import DelayedModel, KnownModel, LogDynamics, LogModel
 from gpmpc.models._kinematics import Increments
@@ -190,6 +191,17 @@ def test_a_model_loop_carries_the_past_on():
     )  # fmt: skip
     assert flown.states.shape == (61, 2)
     np.testing.assert_allclose(flown.predicted_means, flown.states[1:], atol=1e-9)
+
+
+def test_recorded_flights_are_predicted_with_their_past():
+    flown = closed_loop(PLANT, controller(dynamics()), GOAL, None, 30)
+    # A row at rest comes before it.
+    states = np.vstack([flown.states[:1], flown.states])
+    inputs = np.vstack([[0.0], flown.inputs])
+    judged = calibrate(dynamics(1e-6), [Recording(states, inputs)], horizon=3)
+    assert judged.names == ("x1", "x2")
+    assert judged.samples.tolist() == [31, 30, 29]
+    assert float(judged.rmse.max()) < 1e-9
 
 
 def test_a_delay_is_kept_like_any_other_past():
