@@ -51,7 +51,7 @@ from gpmpc.metrics import (
     mean_squared_error,
     negative_log_predictive_density,
 )
-from gpmpc.models._past import has_past, measured_dim, states_along
+from gpmpc.models._past import has_past, measured_dim, rows_before, states_along
 from gpmpc.propagation import Propagator, best_propagator
 from gpmpc.signals import UNKNOWN, Signals, signals_of
 
@@ -246,7 +246,7 @@ def calibrate(
     rmse = _table(columns, lambda c: math.sqrt(mean_squared_error(c.mean, c.observed)))
     deviation = _table(columns, lambda c: math.sqrt(c.variance.mean()))
     independent = [
-        sum(len(recording) // k for recording in recordings)
+        sum(max(len(rows) - rows_before(model), 0) // k for rows in recordings)
         for k in range(1, horizon + 1)
     ]
     return Calibration(
@@ -318,6 +318,8 @@ def _predict_recording(
 ) -> Iterator[tuple[int, _Predictions]]:
     """Predicts from every state of a recording, some starts at once.
 
+    A model with a past predicts from where the rows before say what it is.
+
     Yields:
         The number of steps ahead, less one, and predictions of as many steps.
     """
@@ -330,7 +332,7 @@ def _predict_recording(
         states = torch.from_numpy(whole)
     further = states.shape[1] - n
     start = pad(noise.start, (0, further, 0, further))
-    for first in range(0, size, CHUNK):
+    for first in range(rows_before(model), size, CHUNK):
         mean = states[first : min(first + CHUNK, size)]
         belief = Gaussian(mean, start.expand(len(mean), *start.shape))
         for k in range(min(horizon, size - first)):
@@ -419,12 +421,13 @@ def _check(
         )
     for recording in recordings:
         signals_of(model).check("the model", recording.signals, "the recording")
-    longest = max(map(len, recordings))
+    back = rows_before(model)
+    longest = max(map(len, recordings)) - back
     if horizon > longest:
-        raise SettingError(
-            "horizon",
-            f"must be at most {longest} steps, the longest recording; got {horizon}",
-        )
+        rule = f"must be at most {longest} steps, the longest recording"
+        if back:
+            rule += f" without the first {back} rows, which the model looks back"
+        raise SettingError("horizon", f"{rule}; got {horizon}")
     if len(names) != n:
         raise ShapeError(f"names must name {n} states; got {len(names)}")
     if not levels or not all(0 < level < 1 for level in levels):

@@ -14,7 +14,7 @@ from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, DynamicsModel, check_next_states
 from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.gaussian import Gaussian
-from gpmpc.models._past import has_past, measured_dim
+from gpmpc.models._past import has_past, measured_dim, rows_before
 from gpmpc.models._wrapper import LinearPart, LinearWrapper
 from gpmpc.signals import signals_of
 
@@ -79,6 +79,11 @@ class DelayedModel(LinearWrapper):
     def measured_dim(self) -> int:
         """Number of the states that are measured: those of the model."""
         return measured_dim(self.model)
+
+    @property
+    def past(self) -> int:
+        """Number of rows after which the state forgets what it began with."""
+        return rows_before(self.model) + self.pending
 
     def at_rest(self, measured: Array, input: Array) -> Array:
         """Returns the state (n + D m,) of a plant that stood where it is measured.

@@ -93,6 +93,11 @@ class LogDynamics:
         return self.model.carried_dim(self.input_dim)
 
     @property
+    def past(self) -> int:
+        """Number of rows after which the state forgets what it began with."""
+        return self.model.past
+
+    @property
     def state_dim(self) -> int:
         """Number of states, n: those that are measured and those beyond."""
         return self.measured_dim + self.carried_dim

@@ -22,6 +22,11 @@ class ModelWithPast(DynamicsModel, Protocol):
         """Number of the states that are measured, the first ones."""
         ...
 
+    @property
+    def past(self) -> int:
+        """Number of rows after which the state forgets what it began with."""
+        ...
+
     def at_rest(self, measured: Array, input: Array) -> Array:
         """Returns the state (n,) of a plant that stood where it is first measured.
 
@@ -55,6 +60,11 @@ def weighed_dim(model: DynamicsModel, problem: Any) -> int:
     measured = measured_dim(model)
     weighs_measured = getattr(problem, "state_dim", None) == measured
     return measured if weighs_measured else model.state_dim
+
+
+def rows_before(model: Any) -> int:
+    """Returns the number of rows after which a model's state is known."""
+    return model.past if has_past(model) else 0
 
 
 def has_past(model: Any) -> TypeGuard[ModelWithPast]:

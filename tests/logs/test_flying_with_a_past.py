@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gpmpc.calibration import Recording, calibrate
+from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import DelayedModel, KnownModel, LogDynamics, LogModel
 from gpmpc.models._kinematics import Increments
@@ -194,14 +195,15 @@ def test_a_model_loop_carries_the_past_on():
 
 
 def test_recorded_flights_are_predicted_with_their_past():
-    flown = closed_loop(PLANT, controller(dynamics()), GOAL, None, 30)
-    # A row at rest comes before it.
-    states = np.vstack([flown.states[:1], flown.states])
-    inputs = np.vstack([[0.0], flown.inputs])
-    judged = calibrate(dynamics(1e-6), [Recording(states, inputs)], horizon=3)
+    flown = closed_loop(PLANT, controller(dynamics()), GOAL, None, 60)
+    recording = Recording(flown.states, flown.inputs)
+    judged = calibrate(dynamics(1e-6), [recording], horizon=3)
     assert judged.names == ("x1", "x2")
-    assert judged.samples.tolist() == [31, 30, 29]
+    known = 60 - dynamics().past  # from where it is known what came before
+    assert judged.samples.tolist() == [known, known - 1, known - 2]
     assert float(judged.rmse.max()) < 1e-9
+    with pytest.raises(SettingError, match=f"at most {known} steps"):
+        calibrate(dynamics(1e-6), [recording], horizon=known + 1)
 
 
 def test_a_delay_is_kept_like_any_other_past():
