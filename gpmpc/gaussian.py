@@ -13,6 +13,8 @@ from torch.autograd import forward_ad
 from gpmpc._arrays import names_of, read_array, sorted_columns
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 
+__all__ = ["Gaussian", "nearest_positive_semidefinite", "square_root"]
+
 _FLOATS = np.dtype(np.float64), np.dtype(np.float32), np.dtype(np.float16)
 
 

@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from multiprocessing import active_children, get_context, resource_tracker
 from typing import TypeVar
 
+__all__ = ["in_processes"]
+
 J = TypeVar("J")
 R = TypeVar("R")
 

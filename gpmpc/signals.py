@@ -12,6 +12,8 @@ from gpmpc._arrays import plain_names
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, ShapeError, check_number
 
+__all__ = ["Signals"]
+
 SAME_STEP = 1e-3  # relative difference of two time steps that are the same: a log's are
 
 

@@ -4,7 +4,6 @@ They are random inputs, our own flights, dithered flights, and the authors' file
 """
 
 from gpmpc.datasets._flights import (
-    SUBSYSTEMS,
     DataSource,
     Excitation,
     ExcitedData,
@@ -15,7 +14,6 @@ from gpmpc.datasets._flights import (
 from gpmpc.datasets._random_data import RandomData
 
 __all__ = [
-    "SUBSYSTEMS",
     "DataSource",
     "Excitation",
     "ExcitedData",

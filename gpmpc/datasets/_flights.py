@@ -25,16 +25,11 @@ from gpmpc.mpc import problem as mpc
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.signals import Signals
 from gpmpc.simulation import Noise, Rollout, closed_loop
-from gpmpc.systems import (
-    ATTITUDES,
-    System,
-    attitude_for_thrust_direction,
-    translational,
-)
-from gpmpc.systems._quadrotor import approach_attitudes
+from gpmpc.systems import System, attitude_for_thrust_direction, translational
+from gpmpc.systems._quadrotor import ATTITUDES, approach_attitudes
 from gpmpc.trajectories import Trajectory
 
-SUBSYSTEMS = ("translational", "rotational")
+_SUBSYSTEMS = ("translational", "rotational")
 
 
 def check_quadrotor(system: System, trajectory: Trajectory | None) -> Trajectory:
@@ -42,8 +37,8 @@ def check_quadrotor(system: System, trajectory: Trajectory | None) -> Trajectory
 
     Raises ``SettingError`` unless there is one and the system is one of the two.
     """
-    if system.name not in SUBSYSTEMS:
-        subsystems = " and ".join(SUBSYSTEMS)
+    if system.name not in _SUBSYSTEMS:
+        subsystems = " and ".join(_SUBSYSTEMS)
         raise SettingError(
             "data",
             f"these data are of {subsystems} alone; data=random is of any system; "
@@ -336,7 +331,7 @@ class ExcitedData:
 
         Their order and the flight's noise have streams of random numbers of their own.
         """
-        seeds = np.random.SeedSequence([self.seed, SUBSYSTEMS.index("rotational")])
+        seeds = np.random.SeedSequence([self.seed, _SUBSYSTEMS.index("rotational")])
         angles = _attitudes(outer_flight, self.attitude)
         reference_count = self.samples + self.rotational.horizon
         attitude_count = -(-reference_count // self.hold)  # rounded up

@@ -419,7 +419,8 @@ class Request(NamedTuple):
     @property
     def constant_guess(self) -> Array:
         """The previous input over the whole horizon (H, m)."""
-        return np.tile(self.references.previous_input, (len(self.guessed_inputs), 1))
+        previous_input = self.references.previous_input[None]
+        return np.repeat(previous_input, len(self.guessed_inputs), axis=0)
 
     def failed_decision(
         self, status: Status, iterations: int = 0, timing: Timing | None = None

@@ -130,7 +130,7 @@ def _hold_belief(prediction: PredictionModel, request: Request) -> Plan:
         covariance[0] = request.covariance
     state = prediction.linearizer.state(request.state[None], covariance)
     return Plan(
-        states=np.tile(state, (count, 1)),
+        states=np.repeat(state, count, axis=0),
         inputs=request.constant_guess,
         covariances=np.repeat(covariance, count, axis=0),
     )

@@ -345,8 +345,9 @@ class PredictionModel:
 
         s_{-1} is the state that the last decision began at.
         """
-        turns = full_turns(request.state - previous.means[0], self.angles)
-        last_mean = previous.means[:1] + turns
+        last_mean = previous.means[:1]
+        if self.angles:
+            last_mean = last_mean + full_turns(request.state - last_mean, self.angles)
         last_state = self.linearizer.state(last_mean, previous.covariances[:1])[0]
         last_input = request.references.previous_input
         c = plan.states[0] - stages.A[0] @ last_state - stages.B[0] @ last_input

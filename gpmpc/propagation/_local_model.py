@@ -108,8 +108,10 @@ def expand_belief(
     """
     propagation, sensitivity = differentiate(propagator, model, belief, input)
     after = propagation.belief
-    covariances = np.stack([to_array(belief.covariance), to_array(after.covariance)])
-    roots = square_roots(covariances)  # of the belief and of the next one
+    covariance = to_array(belief.covariance)[None]
+    next_covariance = to_array(after.covariance)[None]
+    # of the belief and of the next one; ``np.stack`` takes five times as long
+    roots = square_roots(np.concatenate([covariance, next_covariance]))
     A, B = _extended_derivatives(
         sensitivity, root=roots.root[0], next_r=roots.r[1], next_U=roots.U[1]
     )

@@ -30,6 +30,8 @@ from gpmpc.models import DynamicsModel, load_model, save_model
 from gpmpc.parallel import in_processes
 from gpmpc.studies._document import Document, Table
 
+__all__ = ["Study", "TrialSpec", "TrialStore", "run_study"]
+
 _LinAlgError = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
 
 

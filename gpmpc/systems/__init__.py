@@ -21,7 +21,6 @@ from gpmpc.systems._elementary import (
     where,
 )
 from gpmpc.systems._quadrotor import (
-    ATTITUDES,
     Coupled,
     Map,
     Rotational,
@@ -52,7 +51,6 @@ from gpmpc.systems._vehicles import (
 )
 
 __all__ = [
-    "ATTITUDES",
     "GRAVITY",
     "Coupled",
     "DifferentialDrive",
