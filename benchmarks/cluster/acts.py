@@ -211,7 +211,7 @@ class JoblibActs:
     def _process(self) -> None:
         act = self._sweep("process")
         process = self._start_and_hold(act)
-        act.wait_for(2, RunState.RUNNING)
+        act.wait_for(2, RunState.RUNNING, process)
         kill(act.workers()[:1])
         act.hold.unlink()
         code, printed = end_of(process)
@@ -226,7 +226,7 @@ class JoblibActs:
             # While processes start, import, begin runs and fly.
             time.sleep(index * _KILL_INTERVAL)
             if index == _KILLS - 1:
-                act.wait_for(2, RunState.RUNNING)
+                act.wait_for(2, RunState.RUNNING, process)
             process.kill()
             process.communicate()
             act.wait_until_alone()
@@ -239,7 +239,7 @@ class JoblibActs:
         """Starts a command whose runs are held, but not in its own process."""
         began = time.time()
         process = act.start()
-        act.wait_until_planned(since=began)
+        act.wait_until_planned(process, since=began)
         act.hold.touch()
         return process
 
@@ -343,7 +343,7 @@ def _fly_through(act: Sweep, count: int, disturb: Act) -> tuple[int, str]:
     """Flies a sweep, and disturbs it while ``count`` of its runs fly."""
     act.hold.touch()
     process = act.start()
-    act.wait_for(count, RunState.RUNNING)
+    act.wait_for(count, RunState.RUNNING, process)
     disturb()
     act.hold.unlink()
     return end_of(process)
@@ -353,7 +353,7 @@ def _kill_and_repeat(act: Sweep, count: int) -> tuple[int, str]:
     """Kills a sweep while ``count`` of its runs fly, and flies it again."""
     act.hold.touch()
     process = act.start()
-    act.wait_for(count, RunState.RUNNING)
+    act.wait_for(count, RunState.RUNNING, process)
     process.kill()
     process.communicate()
     return end_of(_start_beside(act))
@@ -363,7 +363,7 @@ def _start_thrice(act: Sweep, count: int) -> None:
     """Flies a sweep by two commands at once, and a third one; all are to end well."""
     act.hold.touch()
     processes = [act.start(), act.start()]
-    act.wait_for(count, RunState.RUNNING)
+    act.wait_for(count, RunState.RUNNING, processes[0])
     processes.append(_start_beside(act))
     ends = [end_of(process) for process in processes]
     assert [code for code, _ in ends] == [0, 0, 0], ends
@@ -373,7 +373,7 @@ def _start_beside(act: Sweep) -> subprocess.Popen:
     """Starts a command while runs are held, and lets them go when it has seen them."""
     began = time.time()
     process = act.start()
-    act.wait_until_planned(since=began)
+    act.wait_until_planned(process, since=began)
     act.hold.unlink()
     return process
 

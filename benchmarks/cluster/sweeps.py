@@ -4,7 +4,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -95,24 +95,37 @@ class Sweep:
         """Returns how far the runs are."""
         return [folder.state for folder in self.folders()]
 
-    def wait_until_planned(self, since: float) -> None:
+    def wait_until_planned(self, process: subprocess.Popen, since: float) -> None:
         """Waits until a command has said what it asks for, and looks at the runs."""
-        wait_for(
-            f"another plan of {self.folder.name}",
-            lambda: any(
-                path.stat().st_mtime > since
-                for path in self.folder.glob("sweep-*.json")
-            ),
-            _PATIENCE,
-        )
 
-    def wait_for(self, count: int, state: RunState) -> None:
-        """Waits until so many runs are so far."""
-        wait_for(
+        def is_planned() -> bool:
+            plans = self.folder.glob("sweep-*.json")
+            return any(plan.stat().st_mtime > since for plan in plans)
+
+        self._wait_for(f"another plan of {self.folder.name}", is_planned, process)
+
+    def wait_for(self, count: int, state: RunState, process: subprocess.Popen) -> None:
+        """Waits until so many runs of a command are so far."""
+        self._wait_for(
             f"{count} {state.value} of {self.folder.name}",
             lambda: self.states().count(state) >= count,
-            _PATIENCE,
+            process,
         )
+
+    def _wait_for(
+        self, what: str, ready: Callable[[], bool], process: subprocess.Popen
+    ) -> None:
+        """Waits while a command goes on.
+
+        Raises:
+            AssertionError: It ends before.
+        """
+
+        def ready_or_ended() -> bool:
+            return ready() or process.poll() is not None
+
+        wait_for(what, ready_or_ended, _PATIENCE)
+        assert process.poll() is None, f"{what}: {end_of(process)}"
 
     def workers(self) -> list[int]:
         """Returns the processes of this machine that fly runs."""
