@@ -91,7 +91,10 @@ def train(
     check_kind("system", system, System, example)
     transitions = _named(transitions, system)
     if trainer is None:
-        defaults = {"predicts": "difference", "scaling": standardize}
+        defaults: dict[str, Any] = {
+            "predicts": "difference",
+            "scaling": standardize,
+        }
         trainer = Trainer(**(defaults | settings))
     return _train_on_system(transitions, system, trainer, kinematics, seed)
 
