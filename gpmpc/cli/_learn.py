@@ -225,7 +225,7 @@ def _report(
         f"Intervals hold {_NOISE}.",
         f"Candidates were compared on held-out rows: {learned.folds}.",
     ]
-    lists = {}
+    lists: dict[str, Sequence[str]] = {}
     title = "What was learned, judged on runs that it never saw"
     reasons = _reasons_against(learned, judgement)
     if reasons:

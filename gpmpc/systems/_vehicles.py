@@ -6,7 +6,7 @@ and offsets are parameters.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from gpmpc._calls import explains_arguments
 from gpmpc.systems._elementary import cos, sin, sqrt, tan
@@ -128,8 +128,8 @@ class DifferentialDrive:
     turn_by_second: float = 1.0  #: of the second
     turn_offset: float = 0.0  #: turn rate without inputs [rad/s]
 
-    state_names = ("x", "y", "heading")
-    input_names = ("first", "second")
+    state_names: ClassVar[tuple[str, ...]] = ("x", "y", "heading")
+    input_names: ClassVar[tuple[str, ...]] = ("first", "second")
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (x, y, heading) [m/s, m/s, rad/s]."""
@@ -155,7 +155,13 @@ class LaggedDifferentialDrive(DifferentialDrive):
     speed_decay: float = 3.0  #: one over the time constant of the speed [1/s]
     turn_decay: float = 3.0  #: of the turn rate [1/s]
 
-    state_names = ("x", "y", "heading", "speed", "turn_rate")
+    state_names: ClassVar[tuple[str, ...]] = (
+        "x",
+        "y",
+        "heading",
+        "speed",
+        "turn_rate",
+    )
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt of the state [m/s, m/s, rad/s, m/s^2, rad/s^2]."""
