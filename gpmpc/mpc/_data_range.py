@@ -82,8 +82,10 @@ def beyond_data(model: DynamicsModel, reference: Any) -> list[BeyondData]:
     states = np.atleast_2d(read_reference(reference).in_order(signals).states)
     states = np.asarray(states, dtype=float)
     columns = _columns(model)
+    if not columns:
+        return []
     sizes = (measured_dim(model), model.state_dim)
-    if columns and states.shape[-1] not in sizes:
+    if states.shape[-1] not in sizes:
         raise ShapeError(
             f"reference must have {sizes[0]} states; got {states.shape[-1]}"
         )

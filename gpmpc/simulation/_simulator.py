@@ -268,6 +268,14 @@ def _read_noise(noise: Noise, plant: System) -> Noise:
     return replace(noise, **ordered)
 
 
+def _is_as_long(values: Any, count: int) -> bool:
+    """Returns whether something has so many entries, numbers or not."""
+    try:
+        return len(values) == count
+    except TypeError:
+        return False
+
+
 class ModelSimulator:
     """Simulates a model loop.
 
@@ -286,10 +294,9 @@ class ModelSimulator:
         model = loop.model
         mean = initial.mean if isinstance(initial, Gaussian) else initial
         n = model.state_dim
-        if np.shape(mean) == (measured_dim(model),):
+        if _is_as_long(mean, measured_dim(model)):
             n = measured_dim(model)
         options: Any = {"device": model.device, "dtype": model.dtype}
-        mean = initial
         covariance = _INITIAL_DEVIATION**2 * torch.eye(n, **options)
         names = signals_of(model).state_names
         if isinstance(initial, Gaussian):
