@@ -12,7 +12,7 @@ from benchmarks.cluster.processes import kill, running
 from benchmarks.cluster.ray_nodes import RayNodes
 from benchmarks.cluster.slow import HOLD
 from benchmarks.cluster.slurm import Slurm
-from benchmarks.cluster.sweeps import Sweep, end_of, hold_of
+from benchmarks.cluster.sweeps import Sweep, end_of, hold_of, kill_command
 from gpmpc.studies._run_folder import RunState
 
 Act = Callable[[], None]
@@ -210,10 +210,11 @@ class JoblibActs:
 
     def _process(self) -> None:
         act = self._sweep("process")
-        process = self._start_and_hold(act)
-        act.wait_for(2, RunState.RUNNING, process)
-        kill(act.workers()[:1])
-        act.hold.unlink()
+        # The command looks at the disturbances itself, before it launches runs.
+        process = act.start_planned()
+        with act.holding_runs():
+            act.wait_for(2, RunState.RUNNING, process)
+            kill(act.workers()[:1])
         code, printed = end_of(process)
         assert code == 0, printed
         assert "1 of the runs were flown again" in printed, printed
@@ -222,26 +223,17 @@ class JoblibActs:
     def _driver(self) -> None:
         act = self._sweep("driver")
         for index in range(_KILLS):
-            process = self._start_and_hold(act)
-            # While processes start, import, begin runs and fly.
-            time.sleep(index * _KILL_INTERVAL)
-            if index == _KILLS - 1:
-                act.wait_for(2, RunState.RUNNING, process)
-            process.kill()
-            process.communicate()
-            act.wait_until_alone()
-            act.hold.unlink()
+            process = act.start_planned()
+            with act.holding_runs():
+                # While processes start, import, begin runs and fly.
+                time.sleep(index * _KILL_INTERVAL)
+                if index == _KILLS - 1:
+                    act.wait_for(2, RunState.RUNNING, process)
+                kill_command(process)
+                act.wait_until_alone()
         code, printed = act.fly()
         assert code == 0, printed
         act.check(code, self._stage.reference)
-
-    def _start_and_hold(self, act: Sweep) -> subprocess.Popen:
-        """Starts a command whose runs are held, but not in its own process."""
-        began = time.time()
-        process = act.start()
-        act.wait_until_planned(process, since=began)
-        act.hold.touch()
-        return process
 
     def _sweep(
         self, name: str, runs: int = _FEW, words: Sequence[str] = ("chunk=1",)
@@ -341,41 +333,37 @@ class RayActs:
 
 def _fly_through(act: Sweep, count: int, disturb: Act) -> tuple[int, str]:
     """Flies a sweep, and disturbs it while ``count`` of its runs fly."""
-    act.hold.touch()
-    process = act.start()
-    act.wait_for(count, RunState.RUNNING, process)
-    disturb()
-    act.hold.unlink()
+    with act.holding_runs():
+        process = act.start()
+        act.wait_for(count, RunState.RUNNING, process)
+        disturb()
     return end_of(process)
 
 
 def _kill_and_repeat(act: Sweep, count: int) -> tuple[int, str]:
-    """Kills a sweep while ``count`` of its runs fly, and flies it again."""
-    act.hold.touch()
-    process = act.start()
-    act.wait_for(count, RunState.RUNNING, process)
-    process.kill()
-    process.communicate()
-    return end_of(_start_beside(act))
+    """Kills a sweep while ``count`` of its runs fly, and flies it again.
+
+    The runs are held until the second command has seen them.
+    """
+    with act.holding_runs():
+        process = act.start()
+        act.wait_for(count, RunState.RUNNING, process)
+        kill_command(process)
+        successor = act.start_planned()
+    return end_of(successor)
 
 
 def _start_thrice(act: Sweep, count: int) -> None:
-    """Flies a sweep by two commands at once, and a third one; all are to end well."""
-    act.hold.touch()
-    processes = [act.start(), act.start()]
-    act.wait_for(count, RunState.RUNNING, processes[0])
-    processes.append(_start_beside(act))
+    """Flies a sweep by two commands at once, and a third one; all are to end well.
+
+    The runs are held until the third command has seen them.
+    """
+    with act.holding_runs():
+        processes = [act.start(), act.start()]
+        act.wait_for(count, RunState.RUNNING, processes[0])
+        processes.append(act.start_planned())
     ends = [end_of(process) for process in processes]
     assert [code for code, _ in ends] == [0, 0, 0], ends
-
-
-def _start_beside(act: Sweep) -> subprocess.Popen:
-    """Starts a command while runs are held, and lets them go when it has seen them."""
-    began = time.time()
-    process = act.start()
-    act.wait_until_planned(process, since=began)
-    act.hold.unlink()
-    return process
 
 
 def run(acts: Mapping[str, Act], where: str) -> list[tuple[str, str, str, float]]:

@@ -4,7 +4,9 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ from gpmpc.studies._run_folder import RunFolder, RunState
 
 ROOT = Path(__file__).resolve().parents[2]
 _MARK = "GPMPC_ACT"  # variable: the act that it belongs to
-_PATIENCE = 3600.0  # for a sweep: it ends long before, unless it hangs [s]
+_PATIENCE = 1200.0  # for a sweep: it ends long before, unless it hangs [s]
 _END = 120.0  # within which the processes of a sweep that has ended are gone [s]
 _WORDS = [
     "system=double_integrator", "steps=2", "data.samples=25", "model.restarts=0",
@@ -52,10 +54,18 @@ class Sweep:
     launcher: Sequence[str]
     environment: Mapping[str, str]
 
-    @property
-    def hold(self) -> Path:
-        """A file; while it is there, no step of a run ends."""
-        return hold_of(self.folder)
+    @contextmanager
+    def holding_runs(self) -> Iterator[None]:
+        """Keeps every step of a run from ending inside; then lets them all go.
+
+        So runs do not wait for ever, and keep nodes busy, where an act fails meanwhile.
+        """
+        hold = hold_of(self.folder)
+        hold.touch()
+        try:
+            yield
+        finally:
+            hold.unlink()
 
     def start(self, *words: str) -> subprocess.Popen:
         """Starts the command, as a user does."""
@@ -77,6 +87,18 @@ class Sweep:
             text=True,
         )
 
+    def start_planned(self) -> subprocess.Popen:
+        """Starts the command, and waits until it is about to launch runs."""
+        began = time.time()
+        process = self.start()
+
+        def is_planned() -> bool:
+            plans = self.folder.glob("sweep-*.json")
+            return any(plan.stat().st_mtime > began for plan in plans)
+
+        self._wait_for(f"another plan of {self.folder.name}", is_planned, process)
+        return process
+
     def fly(self, *words: str) -> tuple[int, str]:
         """Runs the command to its end; returns its exit code and what it prints."""
         return end_of(self.start(*words))
@@ -94,15 +116,6 @@ class Sweep:
     def states(self) -> list[RunState]:
         """Returns how far the runs are."""
         return [folder.state for folder in self.folders()]
-
-    def wait_until_planned(self, process: subprocess.Popen, since: float) -> None:
-        """Waits until a command has said what it asks for, and looks at the runs."""
-
-        def is_planned() -> bool:
-            plans = self.folder.glob("sweep-*.json")
-            return any(plan.stat().st_mtime > since for plan in plans)
-
-        self._wait_for(f"another plan of {self.folder.name}", is_planned, process)
 
     def wait_for(self, count: int, state: RunState, process: subprocess.Popen) -> None:
         """Waits until so many runs of a command are so far."""
@@ -186,3 +199,13 @@ def end_of(process: subprocess.Popen) -> tuple[int, str]:
     """Waits for a command; returns its exit code and what it printed."""
     printed, _ = process.communicate(timeout=_PATIENCE)
     return process.returncode, printed
+
+
+def kill_command(process: subprocess.Popen) -> None:
+    """Kills a command alone; what it started here is to end by itself.
+
+    Raises:
+        TimeoutExpired: It does not, and holds the command's output open.
+    """
+    process.kill()
+    process.communicate(timeout=_END)
