@@ -43,7 +43,7 @@ bench: $(ENV)  ## What everything costs on this machine, beside others; some of 
 guard: $(ENV)  ## Whether anything became slower since the last commit, both timed in turns
 	.venv/bin/python -m benchmarks.guard
 
-cluster: $(ENV)  ## Sweeps on a real Slurm and a real Ray of two nodes, for half an hour; root; options: make cluster ARGS="--on ray"
+cluster: $(ENV)  ## Sweeps on a real Slurm and a real Ray of two nodes, for more than an hour; root; options: make cluster ARGS="--on ray"
 	.venv/bin/python -m pip install --quiet --constraint constraints.txt "ray>=2.40"
 	.venv/bin/python -m benchmarks.cluster $(ARGS)
 

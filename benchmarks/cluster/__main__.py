@@ -6,7 +6,7 @@
 Flies sweeps by joblib, then starts Slurm without accounting, Slurm with it, and Ray,
 and flies them on each, while it kills, cancels and hides; prints a table. After every
 act each run is accounted for, has the numbers of the basic launcher, the exit code is
-true, and no process is left. It takes half an hour on two idle cores, and has patience
+true, and no process is left. It takes more than an hour on two cores, and has patience
 where they are busy.
 
 Slurm needs root and the packages slurmctld, slurmd, slurm-client and munge of Debian or

@@ -466,7 +466,15 @@ class _ControlStep:
             self._warm_start = request.previous.solution
 
     def run(self, local: LocalProblem) -> Decision:
-        """Returns the decision that programs lead to from the problem at a guess."""
+        """Returns the decision that programs lead to from the problem at a guess.
+
+        Each round solves the program of ``local`` and takes its step, which leads to
+        the next ``local``. The last round is the one whose program fails, whose step
+        says so by a status, or behind which a limit allows no other. Its plan is rolled
+        out where it may not obey the dynamics. Where that misses a curved bound by more
+        than the program promised, one more round starts at the plan that was rolled
+        out.
+        """
         guess = local.plan
         while True:
             self._stopwatch.lap("model")
@@ -475,24 +483,26 @@ class _ControlStep:
             solution = self._solve(program, local)
             self._stopwatch.lap("solve")
             if not _is_usable(program, solution, local.plan):
+                # The plan of the round before is the last one.
                 if local.plan is not guess:
                     local = self._close_defects(local, local, program)
                 return self._conclude(local, guess, solution, solution.status)
             iterate = self._take_step(local, program, solution)
-            if iterate.status is None and self._may_go_on:
+            status = iterate.status
+            if status is None and self._may_go_on:
                 local = iterate.local
                 continue
             ending = iterate.local
             if iterate.leaves_defects or self._prediction.rolls_out:
                 ending = self._close_defects(ending, local, program)
-            breaks_promise = self._breaks_promise(iterate.status, ending, solution)
+            breaks_promise = self._breaks_promise(status, ending, solution)
             if breaks_promise and self._may_go_on:
                 # A curved bound lies elsewhere than the program saw it.
                 local = self._prediction.linearize(ending.plan, self._request)
                 continue
-            status = iterate.status
-            # A single program was never to keep more than it promised.
-            if status is None or (breaks_promise and self._most_programs > 1):
+            # Who asked for a single program takes the plan as it is.
+            is_stopped_early = breaks_promise and self._most_programs > 1
+            if status is None or is_stopped_early:
                 status = self._limit
             return self._conclude(ending, guess, solution, status)
 
