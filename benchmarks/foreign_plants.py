@@ -37,7 +37,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.chance_constraints import Plant, climbing, fly, logged
+from benchmarks.chance_constraints import Flights, Plant, climbing, fly, logged
 from gpmpc.gp import Transitions, standardize
 from gpmpc.metrics import binomial_interval
 from gpmpc.models import train
@@ -64,15 +64,15 @@ class Described:
         return [x[i] for i in range(len(self.state_names))]
 
 
-def stirred_tank() -> Flown:
-    """pc-gym's tank: concentration [mol/L] and temperature [K], by its coolant."""
+def _reactor() -> Any:
+    """Returns pc-gym's environment, for as many steps as all flights take."""
     import casadi
     from pcgym import make_env
 
     # pc-gym integrates by CasADi, whose note on NumPy is the same at every call.
     casadi.GlobalOptions.setNumpyMode(-1)
     steps = 10_000
-    reactor = make_env(
+    return make_env(
         {
             "model": "cstr",
             "N": steps,
@@ -94,6 +94,11 @@ def stirred_tank() -> Flown:
         }
     )
 
+
+def stirred_tank() -> Flown:
+    """pc-gym's tank: concentration [mol/L] and temperature [K], by its coolant."""
+    reactor = _reactor()
+
     def begin() -> Array:
         return reactor.reset()[0][:2].copy()
 
@@ -114,8 +119,11 @@ def stirred_tank() -> Flown:
         weights=([10.0, 0.1], [0.1]),
         limits=[1.0],
     )
-    names = ("concentration", "temperature"), ("coolant",)
-    return plant, System(Described(*names), time_step=0.1)
+    names = Described(
+        state_names=("concentration", "temperature"),
+        input_names=("coolant",),
+    )
+    return plant, System(names, time_step=0.1)
 
 
 def rotorpy_crazyflie() -> Flown:
@@ -137,8 +145,11 @@ def rotorpy_crazyflie() -> Flown:
             state.update(drone.step(state, {"cmd_v": np.array(command)}, 0.02))
         return np.array(state["v"])
 
-    names = ("vx", "vy", "vz"), ("cx", "cy", "cz")
-    return climbing(begin, move), System(Described(*names), time_step=0.2)
+    names = Described(
+        state_names=("vx", "vy", "vz"),
+        input_names=("cx", "cy", "cz"),
+    )
+    return climbing(begin, move), System(names, time_step=0.2)
 
 
 def crazyflow_crazyflie() -> Flown:
@@ -188,9 +199,12 @@ def crazyflow_crazyflie() -> Flown:
         weights=([1.0, 1.0, 0.1, 0.01], [1.0, 1.0]),
         limits=[0.2, 0.2],
     )
-    names = ("vx", "vz", "pitch", "pitch_rate"), ("command", "thrust")
+    names = Described(
+        state_names=("vx", "vz", "pitch", "pitch_rate"),
+        input_names=("command", "thrust"),
+    )
     system = System(
-        Described(*names),
+        names,
         time_step=0.2,
         angles=["pitch"],
         rates={"pitch_rate": "pitch"},
@@ -254,23 +268,29 @@ def main() -> None:
         for way in WAYS:
             for allowed in ALLOWED:
                 eta = 1.0 - allowed
-                quantile = NormalDist().inv_cdf(eta) if way == WAYS[0] else None
                 flights = fly(
-                    plant,
-                    model,
-                    eta,
-                    quantile,
+                    plant=plant,
+                    model=model,
+                    eta=eta,
+                    quantile=NormalDist().inv_cdf(eta) if way == WAYS[0] else None,
                     steps=arguments.steps,
                     seeds=arguments.seeds,
                 )
-                count = flights.active
-                low, high = binomial_interval(flights.violations, count)
                 print(
-                    f"| {name} | {way} | {allowed:.0%} | {flights.violations} of "
-                    f"{count} | {flights.violations / max(count, 1):.1%} ({low:.1%} "
-                    f"to {high:.1%}) | {flights.distance:.3g} |",
+                    f"| {name} | {way} | {allowed:.0%} | {_cells(flights)} |",
                     flush=True,
                 )
+
+
+def _cells(flights: Flights) -> str:
+    """Returns how often a bound was violated, and the distance, as cells of a table."""
+    count = flights.active
+    low, high = binomial_interval(flights.violations, count)
+    rate = flights.violations / max(count, 1)
+    return (
+        f"{flights.violations} of {count} | {rate:.1%} ({low:.1%} to {high:.1%}) | "
+        f"{flights.distance:.3g}"
+    )
 
 
 if __name__ == "__main__":

@@ -44,21 +44,35 @@ class Task:
 
 
 TASKS = {
-    "pendulum": Task((0.0, 0.0), (1.0, 0.01), (0.01,), horizon=150, steps=500),
-    "lagging pendulum": Task((np.pi, 0.0), (1.0, 0.01), (0.01,), horizon=60, steps=400),
+    "pendulum": Task(goal=(0.0, 0.0), Q=(1.0, 0.01), R=(0.01,), horizon=150, steps=500),
+    "lagging pendulum": Task(
+        goal=(np.pi, 0.0), Q=(1.0, 0.01), R=(0.01,), horizon=60, steps=400
+    ),
     "cart-pole": Task(
-        (0.0, 0.0, 0.0, 0.0), (1.0, 0.01, 1.0, 0.01), (0.01,), horizon=100, steps=500
+        goal=(0.0, 0.0, 0.0, 0.0),
+        Q=(1.0, 0.01, 1.0, 0.01),
+        R=(0.01,),
+        horizon=100,
+        steps=500,
     ),
     "quadruple tank": Task(
-        (12.4, 12.7, 1.8, 1.4), (1.0, 1.0, 0.0, 0.0), (0.01, 0.01), 100, steps=1500
+        goal=(12.4, 12.7, 1.8, 1.4),
+        Q=(1.0, 1.0, 0.0, 0.0),
+        R=(0.01, 0.01),
+        horizon=100,
+        steps=1500,
     ),
     "two-link arm": Task(
-        (1.0, -0.8, 0.0, 0.0), (1.0, 1.0, 0.01, 0.01), (0.001, 0.001), 40, steps=200
+        goal=(1.0, -0.8, 0.0, 0.0),
+        Q=(1.0, 1.0, 0.01, 0.01),
+        R=(0.001, 0.001),
+        horizon=40,
+        steps=200,
     ),
     "quadrotor": Task(
-        (0.5, -0.4, 1.4, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0),
-        (10.0,) * 3 + (1.0,) * 4 + (1.0,) * 3 + (0.1,) * 3,
-        (0.1,) * 4,
+        goal=(0.5, -0.4, 1.4, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0),
+        Q=(10.0,) * 3 + (1.0,) * 4 + (1.0,) * 3 + (0.1,) * 3,
+        R=(0.1,) * 4,
         horizon=40,
         steps=300,
         changes={"initial_input": [0.5 * GRAVITY / 4] * 4},
@@ -144,20 +158,21 @@ def fly(plant: Plant, model: DynamicsModel, seed: int = 0) -> FlightCost:
 def compare(plant: Plant, learned: IdentifiedModel, seed: int) -> dict[str, Any]:
     """Flies a learned model and one of clean transitions; prints and returns both."""
     models = {"learned": learned_model(learned), "clean": clean_model(plant, seed)}
-    flown = {}
+    flights = {}
     for name, model in models.items():
-        flight = flown[name] = fly(plant, model, seed)
+        flight = fly(plant, model, seed)
+        flights[name] = flight
         print(
             f"  {name:8s} cost {flight.cost:.4g}, {flight.milliseconds:.1f} ms, "
             f"ends at {flight.end}; {flight.judgement}",
             flush=True,
         )
-    ratio = flown["learned"].cost / flown["clean"].cost
+    ratio = flights["learned"].cost / flights["clean"].cost
     fault = "" if ratio <= MOST else "  COSTS MORE"
     print(f"  flown at {ratio:.3f} of the cost{fault}")
     return {
         "case": f"{plant.name}, seed {seed}",
         "rate": RATE,
         "ratio": ratio,
-        "flights": {name: flight._asdict() for name, flight in flown.items()},
+        "flights": {name: flight._asdict() for name, flight in flights.items()},
     }
