@@ -397,19 +397,21 @@ def _sbatch(options: Sequence[str], script: str, name: str) -> str:
     Raises:
         GpmpcError: Slurm refuses it, or stays busy.
     """
+    command = ["sbatch", "--parsable", *options]
     waits = iter(_WAITS)
-    while True:
-        answer = _run(["sbatch", "--parsable", *options], script=script)
-        if answer.returncode == 0:
-            return answer.stdout.strip()
-        jobs = _queue() or {}
-        numbers = [job.number for (array, _), job in jobs.items() if array == name]
-        if numbers:
-            return numbers[0].partition("_")[0]
+    answer = _run(command, script=script)
+    while answer.returncode:
+        jobs = _queue()
+        for (array, _), job in (jobs or {}).items():
+            if array == name:
+                return job.number.partition("_")[0]
         wait = next(waits, None)
         if wait is None or not _BUSY.search(answer.stderr):
             raise GpmpcError(f"Slurm refuses the sweep: {_one_line(answer.stderr)}")
         time.sleep(wait)
+        if jobs is not None:  # else it may have taken it, and is asked once more
+            answer = _run(command, script=script)
+    return answer.stdout.strip()
 
 
 def _queue() -> dict[tuple[str, int], _Job] | None:

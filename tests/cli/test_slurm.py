@@ -288,10 +288,14 @@ def test_a_refused_submission_is_one_line_and_leaves_nothing(fake, tree):
     assert not [*tree.glob(".slurm/gpmpc-*")]
 
 
-@pytest.mark.parametrize("answer", ["refuses", "takes it"])
-def test_a_busy_slurm_gets_an_array_once(answer, fake, tree, monkeypatch):
+@pytest.mark.parametrize(
+    ("answer", "silent"), [("refuses", False), ("takes it", False), ("takes it", True)]
+)
+def test_a_busy_slurm_gets_an_array_once(answer, silent, fake, tree, monkeypatch):
     monkeypatch.setattr(_slurm, "_WAITS", (0.0,))
     (fake / "busy").write_text(answer)
+    if silent:  # at the first look at the queue
+        (fake / "silent").touch()
     (fake / "queue").write_text("0|COMPLETED|None|n1\n")
     (job,) = jobs_of(tree, "flies")
     assert outcomes(tree, [job], flown_before=["0-flies"]) == ["finished"]
