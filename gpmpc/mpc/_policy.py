@@ -231,6 +231,7 @@ class ControlLoop:
         self._steps = 0
         self._judge: FlightJudge | None = None
         self._before_last: Command | None = None
+        self._measured_dim = 0  # of the last state; plans may be of more
         # The last plan whose feedback was needed, and its gains (H, m, n).
         self._gains: tuple[Decision, np.ndarray] | None = None
 
@@ -260,6 +261,7 @@ class ControlLoop:
         followed = read_reference(reference)
         if followed.signals is not UNKNOWN:
             followed = followed.in_order(signals)
+        self._measured_dim = belief.mean.shape[-1]
         self._before_last = self.last
         self.last = decide(
             self.controller,
@@ -322,16 +324,6 @@ class ControlLoop:
             error = self._short_way(state - planned_state)
             input = input - self._gains_of(plan)[stage][:, :n] @ error
         return _within_bounds(self.controller, input, self._before_last)
-
-    @property
-    def _measured_dim(self) -> int:
-        """Number of the states that are measured of those of the plan."""
-        assert self.last is not None
-        assert self.last.plan is not None
-        decision = self.last.decision
-        if self.last.state is None or decision is None:
-            return self.last.plan.means.shape[1]
-        return decision.means.shape[1]
 
     def _gains_of(self, plan: Decision) -> np.ndarray:
         """Returns the gains (H, m, n) of a plan's feedback; zero without any."""

@@ -176,6 +176,21 @@ def test_a_loop_of_ones_own_keeps_it_as_well():
     assert pushed < expected
 
 
+def test_a_loop_corrects_between_steps_whatever_was_measured():
+    loop = ControlLoop(controller(dynamics()))
+    start = np.zeros(2)
+    lost = np.full(2, np.nan)
+    applied = loop.input(lost, GOAL)
+    assert loop.input_between(start, 0.0) == applied
+    loop.input(start, GOAL)
+    applied = loop.input(lost, GOAL)
+    assert loop.last is not None
+    assert loop.last.plan is not None
+    planned = loop.last.plan.means[0, :2]
+    assert loop.input_between(planned, 0.0) == pytest.approx(applied)
+    assert loop.input_between(planned + np.array([0.1, 0.0]), 0.0) < applied
+
+
 def test_stability_is_judged_with_the_past():
     steady = controller(dynamics()).stability(GOAL)
     assert steady.stable
