@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from benchmarks.cluster.processes import kill, running
 from benchmarks.cluster.ray_nodes import RayNodes
@@ -32,6 +32,14 @@ class Stage:
     folder: Path
     #: numbers of the basic launcher by seed
     reference: Mapping[int, Any]
+
+
+class _Job(NamedTuple):
+    """A job as squeue tells it."""
+
+    number: str  # of its array and in it, such as 7_0
+    state: str
+    host: str
 
 
 class SlurmActs:
@@ -64,7 +72,7 @@ class SlurmActs:
         act = self._sweep("many", MANY, words=_SHARED)
         code, printed = act.fly()
         assert code == 0, printed
-        hosts = {row.split("|")[2] for row in self._jobs(act).values()}
+        hosts = {job.host for job in self._jobs(act)}
         assert hosts == {"n1", "n2"}, hosts
         act.check(code, self._stage.reference)
 
@@ -168,20 +176,18 @@ class SlurmActs:
             environment=self._slurm.environment,
         )
 
-    def _jobs(self, act: Sweep) -> dict[int, str]:
-        """Returns the state of the only array of a sweep, by number of the job."""
+    def _jobs(self, act: Sweep) -> list[_Job]:
+        """Returns the jobs of the only array of a sweep."""
         (folder,) = (act.folder / ".slurm").glob("gpmpc-*")
-        listed = self._slurm.ask(
+        answer = self._slurm.ask(
             "squeue", "--noheader", "--array", f"--name={folder.name}",
-            "--states=all", "--format=%K|%F_%K|%T|%N",
+            "--states=all", "--format=%F_%K|%T|%N",
         )  # fmt: skip
-        rows = [line.split("|") for line in listed.splitlines()]
-        return {int(index): "|".join(row) for index, *row in rows}
+        return [_Job(*line.split("|")) for line in answer.splitlines()]
 
     def _number(self, act: Sweep, state: str) -> str:
         """Returns the number of a job in a state."""
-        rows = [row.split("|") for row in self._jobs(act).values()]
-        return next(row[0] for row in rows if row[1] == state)
+        return next(job.number for job in self._jobs(act) if job.state == state)
 
 
 class JoblibActs:
