@@ -160,8 +160,8 @@ def inspect_log(
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     file = pathlib.Path(folder, "drive.csv")
     ...     _ = file.write_text("t,x\n0.0,0.0\n0.1,0.1\n0.2,0.2\n0.3,0.3\n")
-    ...     found = inspect_log(file)
-    >>> len(found.gaps)
+    ...     inspection = inspect_log(file)
+    >>> len(inspection.gaps)
     0
 
     See Also:

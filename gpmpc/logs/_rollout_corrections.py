@@ -90,20 +90,17 @@ def choose_averages(
         judged_steps: Whose errors decide.
     """
     errors = _errors_on_other_runs(kinematics, rollouts, judged_steps)
-    groups = rollouts.windows.space.groups
-    shares = np.empty((len(_PRIORS), len(judged_steps), len(groups)))
+    columns_by_group = rollouts.windows.space.error_columns
+    shares = np.empty((len(_PRIORS), len(judged_steps), len(columns_by_group)))
     ratios = np.empty(shares.shape[1:])
     for k in range(len(judged_steps)):
-        first = 0
-        for g, group in enumerate(groups):
-            entries = slice(first, first + group.error_dim)
-            own = errors[:, :, k, entries]
+        for g, columns in enumerate(columns_by_group):
+            own = errors[:, :, k, columns]
             shares[:, k, g] = _choose_shares(own)
             averaged = np.tensordot(shares[:, k, g], own, axes=1)
             # The first prior leaves the rollouts as they are.
-            with_and_without = _mean_length(np.stack([averaged, own[0]])) + _NOTHING
-            ratios[k, g] = with_and_without[0] / with_and_without[1]
-            first += group.error_dim
+            without = _mean_length(own[0]) + _NOTHING
+            ratios[k, g] = (_mean_length(averaged) + _NOTHING) / without
     return Averages(shares, ratios)
 
 

@@ -55,7 +55,7 @@ class Correction:
         windows: Windows,
         predicted: Array,
         steps: Sequence[int],
-        priors: "Sequence[Prior]",
+        priors: Sequence[Prior],
     ) -> list["Correction"]:
         """Fits regressions to the errors of rollouts, one for each of several priors.
 

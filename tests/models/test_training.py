@@ -128,8 +128,8 @@ def test_a_small_error_that_adds_up_is_learned():
     model = train(rows(plant, size=300), system=plant, **QUICK).posterior
     assert model.residual.output_dim == 2
     fresh = Recording.chained(rows(plant, size=150, seed=1))
-    found = calibrate(model, fresh, Linearization(), 10, levels=[0.95])
-    assert float(found.coverage[[0, 9], 0].min()) > 0.9
+    calibration = calibrate(model, fresh, Linearization(), 10, levels=[0.95])
+    assert float(calibration.coverage[[0, 9], 0].min()) > 0.9
 
 
 def test_noise_alone_is_not_learned():
