@@ -197,6 +197,16 @@ class _LinearMaps(NamedTuple):
     regressors_by_memory: Array  # (r, s)
 
 
+class _MemoryMaps(NamedTuple):
+    """How what is remembered, s, moves on, and what regressors show of it."""
+
+    by_memory: Array  # next s by s (s, s)
+    by_features: Array  # (s, d)
+    by_learned: Array  # (s, o)
+    regressors_by_features: Array  # (r, d)
+    regressors_by_memory: Array  # (r, s)
+
+
 def _linear_maps(model: LogModel, m: int, time_step: float) -> _LinearMaps:
     """Returns the linear maps of a model of m inputs."""
     o = len(model.history)
@@ -217,39 +227,53 @@ def _linear_maps(model: LogModel, m: int, time_step: float) -> _LinearMaps:
         acting = lags.acting(state.T, command.T).T
         after[:lagged] = lags.after(state.T, command.T).T
     after[lagged : lagged + pending] = queue[m:]
-    by_features = np.zeros((c, d))
-    by_learned = np.zeros((c, o))
-    regressors_by_features = np.eye(d)
-    regressors_by_memory = np.zeros((d, s))
-    if s or model.weights.size:
-        memory = model.memory
-        first = lagged + pending
-        # The memory is linear, so that its values at unit vectors are its matrices.
-        after[first:, first:c] = _matrix(
-            lambda e: memory.step(e, np.zeros((s, d)), np.zeros((s, o))), s
-        )
-        by_features[first:] = _matrix(
-            lambda e: memory.step(np.zeros((d, s)), e, np.zeros((d, o))), d
-        )
-        by_learned[first:] = _matrix(
-            lambda e: memory.step(np.zeros((o, s)), np.zeros((o, d)), e), o
-        )
-        one = memory.regressors(np.zeros(d), np.zeros(s))
-        regressors_by_features = _matrix(
-            lambda e: memory.regressors(e, np.zeros((d, s))) - one, d
-        )
-        regressors_by_memory = _matrix(
-            lambda e: memory.regressors(np.zeros((s, d)), e) - one, s
-        )
+    first = lagged + pending
+    memory = _memory_maps(model, features=d, size=s)
+    after[first:, first:c] = memory.by_memory
     return _LinearMaps(
         acting_by_carried=acting[:, :c],
         acting_by_input=acting[:, c:],
         carried_by_carried=after[:, :c],
         carried_by_input=after[:, c:],
-        carried_by_features=by_features,
-        carried_by_learned=by_learned,
-        regressors_by_features=regressors_by_features,
-        regressors_by_memory=regressors_by_memory,
+        carried_by_features=np.vstack([np.zeros((first, d)), memory.by_features]),
+        carried_by_learned=np.vstack([np.zeros((first, o)), memory.by_learned]),
+        regressors_by_features=memory.regressors_by_features,
+        regressors_by_memory=memory.regressors_by_memory,
+    )
+
+
+def _memory_maps(model: LogModel, features: int, size: int) -> _MemoryMaps:
+    """Returns the linear maps of a memory of a size (s,) and of features (d,)."""
+    o = len(model.history)
+    d = features
+    s = size
+    if not (s or model.weights.size):
+        return _MemoryMaps(
+            by_memory=np.zeros((0, 0)),
+            by_features=np.zeros((0, d)),
+            by_learned=np.zeros((0, o)),
+            regressors_by_features=np.eye(d),
+            regressors_by_memory=np.zeros((d, 0)),
+        )
+    memory = model.memory
+    one = memory.regressors(np.zeros(d), np.zeros(s))
+    # The memory is linear, so that its values at unit vectors are its matrices.
+    return _MemoryMaps(
+        by_memory=_matrix(
+            lambda e: memory.step(e, np.zeros((s, d)), np.zeros((s, o))), s
+        ),
+        by_features=_matrix(
+            lambda e: memory.step(np.zeros((d, s)), e, np.zeros((d, o))), d
+        ),
+        by_learned=_matrix(
+            lambda e: memory.step(np.zeros((o, s)), np.zeros((o, d)), e), o
+        ),
+        regressors_by_features=_matrix(
+            lambda e: memory.regressors(e, np.zeros((d, s))) - one, d
+        ),
+        regressors_by_memory=_matrix(
+            lambda e: memory.regressors(np.zeros((s, d)), e) - one, s
+        ),
     )
 
 
