@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gpmpc._dynamics import DynamicsModel, to_array
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.export._c_types import fields_type, reference_type
 from gpmpc.export._filter import Estimator
 from gpmpc.export._functions import FunctionWriter, parameter_rows
@@ -86,6 +86,10 @@ class CompiledLibrary:
             raise SettingError("compiler", f"{rule}; got {compiler[0]!r}")
         number = ctypes.c_double if precision == "double" else ctypes.c_float
         self.dtype = np.dtype(number)
+        self._states = controller.prediction.state_dim
+        self._measured = self._states
+        if estimator is not None:
+            self._measured = estimator.filter.measurement.output_dim
         self._inputs = controller.prediction.input_dim
         self._horizon = controller.horizon
         with tempfile.TemporaryDirectory() as folder:
@@ -114,6 +118,7 @@ class CompiledLibrary:
     def reference(self, reference: Reference, parameters: Any = None) -> Any:
         """Returns a reference, and parameters, as the code takes them."""
         followed = reference.over(self._horizon)
+        _check_size("a reference", followed.states, self._states)
         converted = self._reference_type()
         if self._parameters:
             rows = parameter_rows(parameters, self._horizon, self._parameters)
@@ -133,13 +138,19 @@ class CompiledLibrary:
             controller: Of this library.
             measured: What ``gpmpc_step`` takes; a ``Gaussian`` is a belief.
             reference: See ``reference``.
+
+        Raises:
+            ShapeError: What is measured has another size.
         """
         input = np.empty(self._inputs, dtype=self.dtype)
-        step = self._code.gpmpc_step
-        numbers = [measured]
         if isinstance(measured, Gaussian):
             step = self._code.gpmpc_step_belief
             numbers = [to_array(measured.mean), to_array(measured.covariance)]
+            _check_size("a belief", numbers[0], self._states)
+        else:
+            step = self._code.gpmpc_step
+            numbers = [measured]
+            _check_size("a measurement", measured, self._measured)
         arrays = [np.ascontiguousarray(part, dtype=self.dtype) for part in numbers]
         step(
             ctypes.byref(controller.fields),
@@ -148,6 +159,13 @@ class CompiledLibrary:
             _address(input),
         )
         return input.astype(float)
+
+
+def _check_size(name: str, numbers: Any, size: int) -> None:
+    """Raises ``ShapeError`` unless rows have as many numbers as the code reads."""
+    got = np.shape(numbers)
+    if got[-1:] != (size,):
+        raise ShapeError(f"{name} must have {size} numbers; got the shape {got}")
 
 
 def _address(array: Array) -> ctypes.c_void_p:

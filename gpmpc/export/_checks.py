@@ -4,6 +4,7 @@ from typing import Any
 
 from gpmpc._dynamics import check_next_states
 from gpmpc.exceptions import SettingError, check_choice
+from gpmpc.models import DelayedModel
 from gpmpc.mpc import GPMPC
 from gpmpc.qp import DualActiveSet
 
@@ -15,9 +16,19 @@ def check_exportable(controller: Any, on_failure: str) -> None:
         raise SettingError("controller", f"{rule}; got {type(controller).__name__}")
     check_next_states(controller.prediction.model)
     check_choice("on_failure", on_failure, ("previous_plan", "hold"))
+    _check_weighed_states(controller)
     _check_programs(controller)
     _check_covariance(controller)
     _check_solver(controller.solver)
+
+
+def _check_weighed_states(controller: GPMPC) -> None:
+    """Raises where inputs on their way are to be kept by the loop: C keeps none."""
+    n = controller.prediction.state_dim
+    weighed = controller.problem.state_dim
+    if isinstance(controller.prediction.model, DelayedModel) and weighed != n:
+        rule = f"an exported one weighs all {n} states, pending inputs by zero"
+        raise SettingError("problem", f"{rule}; got {weighed}")
 
 
 def _check_programs(controller: GPMPC) -> None:

@@ -10,8 +10,10 @@ from gpmpc.export._models import ModelWriter
 from gpmpc.export._text import Numbers, function, integers
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import CasadiFunction
+from gpmpc.models._tensors import check_like
 from gpmpc.mpc import GPMPC
 from gpmpc.propagation import Linearization
+from gpmpc.signals import signals_of
 
 _SIGNATURE = "static void measurement(const real *x, real *value, real *jacobian)"
 
@@ -43,6 +45,7 @@ def check_estimator(controller: GPMPC, estimator: Any) -> None:
     if estimator.belief.mean.shape != (n,):
         got = tuple(estimator.belief.mean.shape)
         raise ShapeError(f"the estimator's belief must be of {n} states; got {got}")
+    check_like("belief", estimator.belief.mean, kalman.model)
     if kalman.measurement.measured_states is None:
         _tape_of(kalman.measurement.function)
 
@@ -73,7 +76,7 @@ class FilterWriter:
         else:
             model.write(kalman.model, "filter_model")
         measurement = kalman.measurement
-        belief = estimator.belief
+        belief = estimator.belief.in_order(signals_of(kalman.model).state_names)
         table = numbers.table
         noise = to_array(kalman.model.noise_covariance)
         sensor_noise = to_array(measurement.noise_covariance)

@@ -132,7 +132,6 @@ def _flags(controller: GPMPC, numbers: Numbers, on_failure: str) -> dict[str, bo
         "GPMPC_FEEDBACK": settings.feedback,
         "GPMPC_ROLLS_OUT": rolls_out(controller),
         "GPMPC_HELD": settings.is_held,
-        "GPMPC_INCREMENTAL": settings.is_held,
         "GPMPC_ESTIMATES": settings.disturbance_gain > 0,
         "GPMPC_HOLDS": on_failure == "hold",
     }

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpmpc._files import write_whole
-from gpmpc.export._filter import Estimator
+from gpmpc.export._filter import Estimator, check_estimator
 from gpmpc.export._functions import FunctionWriter, parameter_rows
 from gpmpc.export._text import Numbers
 from gpmpc.gaussian import Gaussian
@@ -50,7 +50,12 @@ def answers(
         questions: Step by step.
         on_failure: The policy.
         estimator: A filter of which the controller is given the belief.
+
+    Raises:
+        SettingError: The filter has a part that C cannot hold.
     """
+    if estimator is not None:
+        check_estimator(controller, estimator)
     loop = ControlLoop(controller, on_failure)
     for question in questions:
         began = perf_counter()

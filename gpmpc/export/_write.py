@@ -1,5 +1,6 @@
 """Writes a controller as one header and one source in C99."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -52,8 +53,8 @@ def export_c(
     Args:
         controller: A ``GPMPC`` of one program a step.
         path: The folder, which is made where it does not exist.
-        precision: Of all numbers, ``"double"`` or ``"float"``; the sums of GPs are
-            taken in double in both.
+        precision: Of all numbers, ``"double"`` or ``"float"``; for float, the sums of
+            GPs are taken in whole numbers, far from their points in double.
         on_failure: What is applied where a step fails: ``"previous_plan"`` or
             ``"hold"``; see ``ControlLoop``.
         estimator: A filter of which the code decides for the belief: a step is then
@@ -108,55 +109,70 @@ def _texts(
     settings = definitions(
         controller, numbers, functions, model.sizes, on_failure, estimator
     )
-    names = _names(controller, estimator)
-    header = "\n".join(
-        [
-            _banner("A controller in C: its memory and its calls.", names),
-            "#ifndef GPMPC_H",
-            "#define GPMPC_H",
-            "",
-            "#include <stdint.h>",
-            "",
-            f"typedef {numbers.precision} gpmpc_real;",
-            "",
-            settings.text(),
-            "",
-            _part("core.h"),
-            "#endif",
-            "",
-        ]
-    )
-    gps = ""
-    if model.sizes["POINTS"]:  # a known model has none
-        fixed = _part("fixed.c") if numbers.precision == "float" else ""
-        gps = _part("gp.c").replace("/*{fixed}*/", fixed)
-    generated = "\n".join(
-        [gps, model.text, filter_tables, tables(controller, numbers), functions.text]
-    )
+    generated = [
+        _gp_code(model, numbers),
+        model.text,
+        filter_tables,
+        tables(controller, numbers),
+        functions.text,
+    ]
     parts = {
-        "model": generated,
+        "model": "\n".join(generated),
         "qp": _part("qp.c"),
         "filter": _part("filter.c") if estimator is not None else "",
     }
+    names = _names(controller, estimator)
+    header = _header(settings.text(), numbers.precision, names)
+    return header, _source(parts, names)
+
+
+def _gp_code(model: ModelWriter, numbers: Numbers) -> str:
+    """Returns the code that evaluates GPs; a known model has none."""
+    if not model.sizes["POINTS"]:
+        return ""
+    fixed = _part("fixed.c") if numbers.precision == "float" else ""
+    return _part("gp.c").replace("/*{fixed}*/", fixed)
+
+
+def _header(settings: str, precision: Precision, names: list[str]) -> str:
+    """Returns the header."""
+    lines = [
+        _banner("A controller in C: its memory and its calls.", names),
+        "#ifndef GPMPC_H",
+        "#define GPMPC_H",
+        "",
+        "#include <stdint.h>",
+        "",
+        f"typedef {precision} gpmpc_real;",
+        "",
+        settings,
+        "",
+        _part("core.h"),
+        "#endif",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _source(parts: Mapping[str, str], names: list[str]) -> str:
+    """Returns the source, with parts in their places in ``core.c``."""
     core = _part("core.c")
     for name, text in parts.items():
         core = core.replace(f"/*{{{name}}}*/", text)
-    source = "\n".join(
-        [
-            _banner("A controller in C: tables, model, program and policy.", names),
-            '#include "gpmpc.h"',
-            "",
-            "#include <float.h>",
-            "#include <math.h>",
-            "#include <stdint.h>",
-            "#include <stdlib.h>",
-            "#include <string.h>",
-            "",
-            _part("numbers.h"),
-            core,
-        ]
-    )
-    return header, source
+    lines = [
+        _banner("A controller in C: tables, model, program and policy.", names),
+        '#include "gpmpc.h"',
+        "",
+        "#include <float.h>",
+        "#include <math.h>",
+        "#include <stdint.h>",
+        "#include <stdlib.h>",
+        "#include <string.h>",
+        "",
+        _part("numbers.h"),
+        core,
+    ]
+    return "\n".join(lines)
 
 
 def _part(name: str) -> str:

@@ -4,9 +4,9 @@
 
 typedef gpmpc_real real;
 
-/* The sums of GPs are taken in double whatever the precision is: a GP of smooth
-   dynamics is a sum of large terms that cancel, of which float would leave two
-   digits. */
+/* The sums of GPs are taken in double, or in whole numbers, whatever the precision is:
+   a GP of smooth dynamics is a sum of large terms that cancel, of which float would
+   leave no digit. */
 typedef double wide;
 
 enum {
@@ -335,7 +335,7 @@ static void linearize(gpmpc_controller *controller)
     work->lane = -1;
 }
 
-#if GPMPC_INCREMENTAL
+#if GPMPC_HELD
 /* The held linearisation as that of the increments since the last step:
    c = s_0 - A s_{-1} - B u_{-1}, in which a constant error of the model cancels. */
 static void write_increments(gpmpc_controller *controller)
@@ -1326,7 +1326,7 @@ static int write_problem(gpmpc_controller *controller, const real *state,
 #else
     (void)covariance;
 #endif
-#if GPMPC_INCREMENTAL
+#if GPMPC_HELD
     if (controller->has_plan)
         write_increments(controller);
 #endif

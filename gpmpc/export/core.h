@@ -176,7 +176,7 @@ typedef struct {
 } gpmpc_problem;
 
 /* A controller. What it keeps from step to step comes first; a binding of another
-   language reads it (gpmpc/export/_binding.py). */
+   language reads it (gpmpc/export/_c_types.py). */
 typedef struct {
     /* what the next step needs of the last one */
     int has_input; /* whether an input was applied */

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from gpmpc.exceptions import ShapeError
 from gpmpc.export import CompiledController, CompiledLoop
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
@@ -242,6 +243,18 @@ def test_a_failed_step_knows_no_violation():
     failed = compiled.control(lost, origin, decision)
     assert failed.status is Status.INVALID_MEASUREMENT
     assert np.isnan(failed.violation)
+
+
+def test_states_of_another_size_are_refused():
+    compiled = CompiledLoop(gpmpc(Problem(WEIGHTS, TORQUES)), compiler=COMPILER)
+    short = Gaussian.certain(np.zeros(1))
+    for measured, origin in (
+        ([0.0], np.zeros(2)),
+        (short, np.zeros(2)),
+        (np.zeros(2), np.zeros(1)),
+    ):
+        with pytest.raises(ShapeError, match="must have 2 numbers"):
+            compiled.input(measured, origin)
 
 
 def test_every_operation_of_casadi_is_written():

@@ -184,12 +184,19 @@ def of_other_states():
     return Estimator(kalman, CASES["a disturbance"][2])
 
 
+def of_another_type():
+    belief = CASES["an angle"][2]
+    single = Gaussian(belief.mean.float(), belief.covariance.float())
+    return Estimator(KalmanFilter.extended(GP, one_angle()), single)
+
+
 REFUSED = {
     "estimator": lambda: KalmanFilter.extended(GP, one_angle()),
     "filter": late,
     "filter.propagator": unscented,
     "filter.model": of_other_states,
     "measurement.function": of_torch,
+    "belief": of_another_type,
 }
 
 

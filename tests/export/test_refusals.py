@@ -6,6 +6,7 @@ import torch
 
 from gpmpc.exceptions import SettingError
 from gpmpc.export import export_c
+from gpmpc.models import DelayedModel
 from gpmpc.mpc import GPMPC, Inequality, PredictionSettings, Problem, Tracking
 from gpmpc.mpc.baselines import LQR
 from gpmpc.propagation import Linearization, MomentMatching
@@ -43,6 +44,7 @@ REFUSED = {
     "solver": lambda: gpmpc(solver=PrimalActiveSet()),
     "solver.time_limit": lambda: gpmpc(solver=DualActiveSet(time_limit=1.0)),
     "model": lambda: gpmpc(model=double_integrator()),
+    "problem": lambda: gpmpc(model=DelayedModel(GP, 2)),
     "h": lambda: gpmpc(
         problem=Problem(
             Tracking([1.0, 0.1], [0.05]), constraints=[Inequality(outside_a_disc)]
