@@ -292,17 +292,19 @@ class ModelSimulator:
         self.loop = loop
         self._steps = 0
         model = loop.model
-        mean = initial.mean if isinstance(initial, Gaussian) else initial
-        n = model.state_dim
-        if _is_as_long(mean, measured_dim(model)):
-            n = measured_dim(model)
         options: Any = {"device": model.device, "dtype": model.dtype}
-        covariance = _INITIAL_DEVIATION**2 * torch.eye(n, **options)
         names = signals_of(model).state_names
+        mean = initial
+        covariance = None
         if isinstance(initial, Gaussian):
             belief = initial.in_order(names)
             mean = belief.mean
             covariance = belief.covariance
+        n = model.state_dim
+        if _is_as_long(mean, measured_dim(model)):
+            n = measured_dim(model)
+        if covariance is None:
+            covariance = _INITIAL_DEVIATION**2 * torch.eye(n, **options)
         mean = torch.as_tensor(_check_state(mean, n, names), **options)
         self._belief = Gaussian(mean, covariance.to(**options))
         self._measured_dim = n
