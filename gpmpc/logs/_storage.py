@@ -25,7 +25,7 @@ from gpmpc.logs._learning import IdentifiedModel
 from gpmpc.logs._structures import Candidate
 from gpmpc.models import load_model
 from gpmpc.models._older_files import signals_of_metadata
-from gpmpc.models._past import measured_dim
+from gpmpc.models._past import first_signals, measured_dim
 from gpmpc.models._stored_log_model import (
     LOG_MODEL,
     NamedLogModel,
@@ -157,7 +157,9 @@ class SavedModel:
         measured = measured_dim(model)
         self._check_size("states", measured, signals.state_names, system)
         self._check_size("inputs", model.input_dim, signals.input_names, system)
-        signals.check(self.path, system.signals, system.name, "model")
+        first_signals(signals, measured).check(
+            self.path, system.signals, system.name, "model"
+        )
 
     def _check_size(
         self, key: str, dim: int, names: Sequence[str], system: System

@@ -5,6 +5,7 @@ the rows before: inputs on their way, what lags hold, what is remembered. It is 
 from step to step by ``at_rest``, where a flight begins, and ``follow``.
 """
 
+from dataclasses import replace
 from typing import Any, Protocol, TypeGuard
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 
 from gpmpc._dynamics import Array, DynamicsModel
 from gpmpc.gaussian import Gaussian
+from gpmpc.signals import Signals, signals_of
 
 
 class ModelWithPast(DynamicsModel, Protocol):
@@ -60,6 +62,18 @@ def weighed_dim(model: DynamicsModel, problem: Any) -> int:
     measured = measured_dim(model)
     weighs_measured = getattr(problem, "state_dim", None) == measured
     return measured if weighs_measured else model.state_dim
+
+
+def weighed_signals(model: DynamicsModel, problem: Any) -> Signals:
+    """Returns the signals of a model, of the states that a problem is to weigh."""
+    return first_signals(signals_of(model), weighed_dim(model, problem))
+
+
+def first_signals(signals: Signals, states: int) -> Signals:
+    """Returns signals without the names of states beyond a number of them."""
+    if len(signals.state_names) <= states:
+        return signals
+    return replace(signals, state_names=signals.state_names[:states])
 
 
 def rows_before(model: Any) -> int:

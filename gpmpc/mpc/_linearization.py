@@ -46,7 +46,7 @@ from gpmpc._kernels.linalg import copy_matrix, dot, product
 from gpmpc.exceptions import SettingError, check_choice, check_number
 from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
 from gpmpc.models import RollOut
-from gpmpc.models._past import weighed_dim
+from gpmpc.models._past import weighed_dim, weighed_signals
 from gpmpc.mpc._constraints import ConstraintRows, largest_violation
 from gpmpc.mpc._controller import Decision, Request, check_controller, check_method
 from gpmpc.mpc._cost import PENALIZED, by_stage
@@ -238,6 +238,8 @@ class PredictionModel:
         #: what cost or model take for angles: a sensor may show them within a turn
         self.angles = sorted({*self.problem.cost.angle_indices, *angles_of(model)})
         self.signals = signals_of(model)
+        #: of the states that ``stated_problem`` weighs
+        self.stated_signals = weighed_signals(model, self.stated_problem)
 
     def plan_of(self, means: Array, inputs: Array, covariances: Array) -> Plan:
         """Returns a plan from means (H + 1, n), inputs, and covariances."""

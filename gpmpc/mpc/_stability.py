@@ -111,7 +111,7 @@ def stability(
     parameters: Any = None,
 ) -> Stability:
     """Returns what a loop does near its reference; see ``GPMPC.stability``."""
-    followed = read_reference(reference).in_order(prediction.signals)
+    followed = read_reference(reference).in_order(prediction.stated_signals)
     _check(prediction, plant, ahead)
     horizon = prediction.horizon
     problem = prediction.stated_problem

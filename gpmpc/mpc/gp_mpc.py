@@ -211,7 +211,7 @@ class GPMPC:
     @property
     def signals(self) -> Signals:
         """Names of states and inputs, and time step, as far as the model knows them."""
-        return self.prediction.signals
+        return self.prediction.stated_signals
 
     def control(
         self,

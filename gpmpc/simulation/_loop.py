@@ -9,7 +9,7 @@ grows with their number is memory, so they fly in chunks.
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,9 +23,10 @@ from gpmpc.exceptions import (
     check_number,
 )
 from gpmpc.gaussian import Gaussian
+from gpmpc.models._past import weighed_signals
 from gpmpc.mpc import Controller, Reference
 from gpmpc.mpc._policy import Command, OnFailure, decide_many
-from gpmpc.signals import signals_of
+from gpmpc.signals import Signals, signals_of
 from gpmpc.simulation._disturbances import Disturbance
 from gpmpc.simulation._flight import Flight
 from gpmpc.simulation._rollout import Rollout
@@ -100,7 +101,7 @@ def closed_loop(
         disturbances=disturbances,
         on_failure=on_failure,
         name=getattr(system, "name", "the model loop"),
-        signals=signals_of(system),
+        signals=_steered_signals(system, controller),
     )
     flight = scenario.flight(seed, on_step)
     _fly_together([flight], scenario)
@@ -109,6 +110,14 @@ def closed_loop(
     if flight.error is not None:
         raise flight.error
     return _rollout(flight, scenario)
+
+
+def _steered_signals(system: System | ModelLoop, controller: Controller) -> Signals:
+    """Returns the signals of a system; of a model with a past, of what is measured."""
+    if not isinstance(system, ModelLoop):
+        return signals_of(system)
+    signals = weighed_signals(system.model, getattr(controller, "problem", None))
+    return replace(signals, time_step=system.time_step)
 
 
 @dataclass(frozen=True)

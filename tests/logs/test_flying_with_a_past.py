@@ -9,6 +9,7 @@ import torch
 from gpmpc.calibration import Recording, calibrate
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
+from gpmpc.logs import SavedModel
 from gpmpc.models import DelayedModel, KnownModel, LogDynamics, LogModel
 from gpmpc.models._kinematics import Increments
 from gpmpc.models._log_dynamics import OutputNoise
@@ -224,8 +225,9 @@ def test_recorded_flights_are_predicted_with_their_past():
 def test_a_delay_is_kept_like_any_other_past():
     A = torch.tensor([[1.0, DT], [0.0, 1.0]], dtype=torch.float64)
     B = torch.tensor([[0.0], [DT]], dtype=torch.float64)
-    cart = KnownModel(lambda x, u: x @ A.mT + u @ B.mT, 2, 1)
-    pilot = controller(DelayedModel(cart, 1.5))
+    cart = KnownModel(lambda x, u: x @ A.mT + u @ B.mT, 2, 1, PLANT.signals)
+    delayed = DelayedModel(cart, 1.5)
+    pilot = controller(delayed)
 
     class Delayed(Cart):
         def successor(self, x, u):
@@ -238,6 +240,15 @@ def test_a_delay_is_kept_like_any_other_past():
     flown = closed_loop(System(Delayed(), DT), pilot, GOAL, None, 60)
     np.testing.assert_allclose(flown.predicted_means, flown.states[1:], atol=1e-9)
     assert abs(flown.states[-1] - GOAL).max() < 1e-2
+    # Names are those of what is measured.
+    SavedModel("delayed.safetensors", delayed, delayed.signals).check(PLANT)
+    loop = ControlLoop(pilot)
+    nothing = torch.zeros(2, 2, dtype=torch.float64)
+    applied = loop.input(Gaussian(nothing[0], nothing, ("v", "x")), GOAL)
+    np.testing.assert_array_equal(applied, flown.inputs[0])
+    model_loop = ModelLoop(delayed, Linearization())
+    alone = closed_loop(model_loop, pilot, GOAL, Gaussian.certain([0.0, 0.0]), 20)
+    np.testing.assert_allclose(alone.states, flown.states[:21], atol=1e-9)
 
     class Plain:
         state_names = ("x", "v")

@@ -14,7 +14,7 @@ from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, check_next_states
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
-from gpmpc.models._past import weighed_dim
+from gpmpc.models._past import weighed_dim, weighed_signals
 from gpmpc.mpc._controller import (
     Decision,
     Reference,
@@ -27,7 +27,6 @@ from gpmpc.mpc._linearization import StageCosts, StageLinearizer
 from gpmpc.mpc._riccati import optimal_feedback
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization
-from gpmpc.signals import signals_of
 from gpmpc.status import Status
 
 Array = np.ndarray
@@ -59,7 +58,7 @@ class LQR:
         horizon: int,
         initial_input: Sequence[float],
     ):
-        self.signals = signals_of(model)
+        self.signals = weighed_signals(model, problem)
         _, inputs = check_next_states(model)
         self.initial_input = check_controller(
             problem,

@@ -99,7 +99,7 @@ class StateFormMPC:
         self.solver = solver
         self.options = TIGHT.get(solver, {}) if options is None else options
         self.problem.check_plain("StateFormMPC")
-        self.signals = self.prediction.signals
+        self.signals = self.prediction.stated_signals
         self._program = _StateFormProgram(self.prediction, constraints)
 
     def control(
