@@ -254,8 +254,9 @@ class ControlLoop:
             SolverFailure: The policy is ``"raise"``.
         """
         signals = signals_of(self.controller)
-        belief = state
-        if not isinstance(state, Gaussian):
+        if isinstance(state, Gaussian):
+            belief = state.in_order(signals.state_names)
+        else:
             mean = read_array("state", state, signals.state_names)
             belief = Gaussian.certain(mean)
         followed = read_reference(reference)

@@ -242,10 +242,12 @@ def test_a_delay_is_kept_like_any_other_past():
     assert abs(flown.states[-1] - GOAL).max() < 1e-2
     # Names are those of what is measured.
     SavedModel("delayed.safetensors", delayed, delayed.signals).check(PLANT)
-    loop = ControlLoop(pilot)
-    nothing = torch.zeros(2, 2, dtype=torch.float64)
-    applied = loop.input(Gaussian(nothing[0], nothing, ("v", "x")), GOAL)
-    np.testing.assert_array_equal(applied, flown.inputs[0])
+    state = torch.tensor([0.2, 0.1], dtype=torch.float64)
+    named = Gaussian(state, torch.zeros(2, 2, dtype=torch.float64), ("v", "x"))
+    loops = ControlLoop(pilot), ControlLoop(pilot)
+    applied = loops[0].input(named, GOAL)
+    np.testing.assert_array_equal(applied, loops[1].input([0.1, 0.2], GOAL))
+    assert loops[0].judgement == loops[1].judgement
     model_loop = ModelLoop(delayed, Linearization())
     alone = closed_loop(model_loop, pilot, GOAL, Gaussian.certain([0.0, 0.0]), 20)
     np.testing.assert_allclose(alone.states, flown.states[:21], atol=1e-9)
