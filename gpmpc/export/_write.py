@@ -122,7 +122,7 @@ def _texts(
         "filter": _part("filter.c") if estimator is not None else "",
     }
     names = _names(controller, estimator)
-    header = _header(settings.text(), numbers.precision, names)
+    header = _header(settings.text(), numbers, names)
     return header, _source(parts, names)
 
 
@@ -134,7 +134,7 @@ def _gp_code(model: ModelWriter, numbers: Numbers) -> str:
     return _part("gp.c").replace("/*{fixed}*/", fixed)
 
 
-def _header(settings: str, precision: Precision, names: list[str]) -> str:
+def _header(settings: str, numbers: Numbers, names: list[str]) -> str:
     """Returns the header."""
     lines = [
         _banner("A controller in C: its memory and its calls.", names),
@@ -143,7 +143,7 @@ def _header(settings: str, precision: Precision, names: list[str]) -> str:
         "",
         "#include <stdint.h>",
         "",
-        f"typedef {precision} gpmpc_real;",
+        f"typedef {numbers.precision} gpmpc_real;",
         "",
         settings,
         "",
