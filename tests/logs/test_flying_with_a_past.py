@@ -247,7 +247,6 @@ def test_a_delay_is_kept_like_any_other_past():
     loops = ControlLoop(pilot), ControlLoop(pilot)
     applied = loops[0].input(named, GOAL)
     np.testing.assert_array_equal(applied, loops[1].input([0.1, 0.2], GOAL))
-    assert loops[0].judgement == loops[1].judgement
     model_loop = ModelLoop(delayed, Linearization())
     alone = closed_loop(model_loop, pilot, GOAL, Gaussian.certain([0.0, 0.0]), 20)
     np.testing.assert_allclose(alone.states, flown.states[:21], atol=1e-9)
