@@ -97,7 +97,7 @@ def choose_averages(
         for g, columns in enumerate(columns_by_group):
             own = errors[:, :, k, columns]
             shares[:, k, g] = _choose_shares(own)
-            averaged = np.tensordot(shares[:, k, g], own, axes=1)
+            averaged = np.einsum("a,awe->we", shares[:, k, g], own)
             # The first prior leaves the rollouts as they are.
             without = _mean_length(own[0]) + _NOTHING
             ratios[k, g] = (_mean_length(averaged) + _NOTHING) / without
