@@ -231,7 +231,8 @@ class ControlLoop:
         self._steps = 0
         self._judge: FlightJudge | None = None
         self._before_last: Command | None = None
-        self._measured_dim = 0  # of the last state; plans may be of more
+        # Of the last state; plans may be of more. None before the first call.
+        self._measured_dim: int | None = None
         # The last plan whose feedback was needed, and its gains (H, m, n).
         self._gains: tuple[Decision, np.ndarray] | None = None
 
@@ -315,6 +316,8 @@ class ControlLoop:
         plan = self.last.plan
         state = read_array("state", state, signals_of(self.controller).state_names)
         n = self._measured_dim
+        if n is None:
+            n = plan.means.shape[1]
         if state.shape != (n,):
             raise ShapeError(f"state must have shape {(n,)}; got {state.shape}")
         horizon = len(plan.inputs)
