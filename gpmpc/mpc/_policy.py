@@ -390,13 +390,7 @@ def _conclude(
         fits = _has_right_shape(controller, decision, last)
         plan = _admit(controller, decision, last) if fits else None
         if plan is not None:
-            return Command(
-                input=plan.input,
-                status=status,
-                decision=situation.measured_part(plan),
-                plan=plan,
-                state=situation.state,
-            )
+            return _command(plan, status, decision=plan, situation=situation)
         reason = (
             f"its plan, {status.name}, is not finite or out of its bounds or shape; "
             f"its input: {decision.input}"
@@ -411,6 +405,13 @@ def _conclude(
     if plan is None:
         rule = "no earlier plan and no reference input to fall back on"
         raise SolverFailure(step, f"{reason} ({rule})")
+    return _command(plan, status, decision=decision, situation=situation)
+
+
+def _command(
+    plan: Decision, status: Status, decision: Decision | None, situation: Situation
+) -> Command:
+    """Returns the command of a plan; of the decision it shows what is measured."""
     return Command(
         input=plan.input,
         status=status,
