@@ -51,38 +51,62 @@ class LogLinearizer:
         local = self._differentiate(x, acting)
         outputs = self._outputs(local, parts.memory, covariance)
         after = self._model.kinematics.step(x, outputs.mean, self._time_step)
-        state_by_state, state_by_outputs = self._differentiate_step(x, outputs.mean)
-        by_features = maps.carried_by_features
-        by_learned = maps.carried_by_learned
-        # By state and acting inputs (., n + m), and by what is remembered (., s):
-        state_by_point = state_by_outputs @ outputs.by_point
-        state_by_point[..., :n] += state_by_state
-        carried_by_point = by_features @ local.features_by_point
-        carried_by_point = carried_by_point + by_learned @ outputs.learned_by_point
-        next_by_point = np.concatenate([state_by_point, carried_by_point], axis=1)
-        each_by_learned = np.broadcast_to(by_learned, (len(x), *by_learned.shape))
-        next_by_outputs = np.concatenate([state_by_outputs, each_by_learned], axis=1)
-        next_by_acting = next_by_point[..., n:]
-        A = np.empty((len(x), states.shape[1], states.shape[1]))
-        A[..., :n] = next_by_point[..., :n]
-        A[..., n:] = next_by_acting @ maps.acting_by_carried
-        A[:, n:, n:] += maps.carried_by_carried
-        s = parts.memory.shape[1]
-        if s:
-            A[..., -s:] += next_by_outputs @ outputs.by_memory
-        B = next_by_acting @ maps.acting_by_input
-        B[:, n:] += maps.carried_by_input
         carried_after = (
             carried @ maps.carried_by_carried.T
             + inputs @ maps.carried_by_input.T
-            + local.features @ by_features.T
-            + outputs.learned @ by_learned.T
+            + local.features @ maps.carried_by_features.T
+            + outputs.learned @ maps.carried_by_learned.T
         )
+        slopes = self._next_slopes(x, local, outputs)
         V = None
         if covariance:
-            V = next_by_outputs @ outputs.covariance @ next_by_outputs.mT
-        mean = np.concatenate([after, carried_after], axis=1)
-        return Linearized(mean, A, np.ascontiguousarray(B), V)
+            V = slopes.by_outputs @ outputs.covariance @ slopes.by_outputs.mT
+        return Linearized(
+            np.concatenate([after, carried_after], axis=1),
+            self._by_state(slopes, outputs.by_memory),
+            self._by_input(slopes),
+            V,
+        )
+
+    def _next_slopes(
+        self, x: Array, local: "_Point", outputs: "_LocalOutputs"
+    ) -> "_NextSlopes":
+        """Returns the derivatives of the next state, with all that it carries on."""
+        maps = self._maps
+        state_by_state, state_by_outputs = self._differentiate_step(x, outputs.mean)
+        state_by_point = state_by_outputs @ outputs.by_point
+        state_by_point[..., : self._n] += state_by_state
+        carried_by_point = maps.carried_by_features @ local.features_by_point
+        carried_by_point = (
+            carried_by_point + maps.carried_by_learned @ outputs.learned_by_point
+        )
+        carried_by_outputs = np.broadcast_to(
+            maps.carried_by_learned, (len(x), *maps.carried_by_learned.shape)
+        )
+        return _NextSlopes(
+            by_point=np.concatenate([state_by_point, carried_by_point], axis=1),
+            by_outputs=np.concatenate([state_by_outputs, carried_by_outputs], axis=1),
+        )
+
+    def _by_state(self, slopes: "_NextSlopes", by_memory: Array) -> Array:
+        """Returns A, the derivatives by the state and what is carried on (K, N, N)."""
+        n = self._n
+        maps = self._maps
+        points, size, _ = slopes.by_point.shape
+        A = np.empty((points, size, size))
+        A[..., :n] = slopes.by_point[..., :n]
+        A[..., n:] = slopes.by_point[..., n:] @ maps.acting_by_carried
+        A[:, n:, n:] += maps.carried_by_carried
+        s = by_memory.shape[-1]
+        if s:
+            A[..., -s:] += slopes.by_outputs @ by_memory
+        return A
+
+    def _by_input(self, slopes: "_NextSlopes") -> Array:
+        """Returns B, the derivatives by the input (K, N, m)."""
+        B = slopes.by_point[..., self._n :] @ self._maps.acting_by_input
+        B[:, self._n :] += self._maps.carried_by_input
+        return np.ascontiguousarray(B)
 
     def _differentiate(self, x: Array, acting: Array) -> "_Point":
         """Evaluates features and nominal outputs, with their derivatives."""
@@ -182,6 +206,13 @@ class _LocalOutputs(NamedTuple):
     learned_by_point: Array  # of what they add (K, o, n + m)
     by_memory: Array  # of both, by s (K, o, s)
     covariance: Array  # of the GPs (K, o, o)
+
+
+class _NextSlopes(NamedTuple):
+    """Derivatives of the N entries of the next state, at K points."""
+
+    by_point: Array  # by x and the acting inputs (K, N, n + m)
+    by_outputs: Array  # by linear term and GPs (K, N, o)
 
 
 class _LinearMaps(NamedTuple):
