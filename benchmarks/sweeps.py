@@ -24,24 +24,25 @@ FLIGHT = ["system=double_integrator", "steps=2", "recorder=none"]
 SEEDS = 10  # of every combination of settings
 
 
-class Memory(NamedTuple):
-    """What a process held at a time."""
+class Sample(NamedTuple):
+    """What a process held, and had worked, at a time."""
 
     time: float  # since the epoch [s]
     megabytes: float
+    processor_time: float  # [s]
 
 
-def gpmpc(*words: str, memory: list[Memory] | None = None) -> tuple[str, float, float]:
+def gpmpc(*words: str, samples: list[Sample] | None = None) -> tuple[str, float, float]:
     """Runs the command; returns what it printed, time [s] and most memory [MB].
 
-    ``memory`` takes what it holds, every half second.
+    ``samples`` takes what it holds and has worked, every half second.
     """
     command = [sys.executable, "-c", "from gpmpc.cli import main; main()", *words]
     start = time.perf_counter()
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
-        if memory is not None:
-            watch = threading.Thread(target=_watch, args=(process.pid, memory))
+        if samples is not None:
+            watch = threading.Thread(target=_watch, args=(process.pid, samples))
             watch.start()
         output = process.stdout.read()
         _, status, usage = os.wait4(process.pid, 0)
@@ -54,18 +55,22 @@ def gpmpc(*words: str, memory: list[Memory] | None = None) -> tuple[str, float, 
     return output, seconds, usage.ru_maxrss / 1024
 
 
-def _watch(process: int, memory: list[Memory]) -> None:
-    """Notes the memory of a process until it ends."""
+def _watch(process: int, samples: list[Sample]) -> None:
+    """Notes memory and processor time of a process until it ends."""
     page = os.sysconf("SC_PAGE_SIZE")
-    status = Path(f"/proc/{process}/statm")
+    tick = 1 / os.sysconf("SC_CLK_TCK")
+    files = Path(f"/proc/{process}")
     while True:
         try:
-            pages = int(status.read_text().split()[1])
+            pages = int((files / "statm").read_text().split()[1])
+            # Behind the name, in which spaces may be.
+            fields = (files / "stat").read_text().rpartition(")")[2].split()
         except (OSError, IndexError):
             return
         if pages == 0:  # it has ended
             return
-        memory.append(Memory(time.time(), 1e-6 * pages * page))
+        ticks = int(fields[11]) + int(fields[12])  # of the user and the system
+        samples.append(Sample(time.time(), 1e-6 * pages * page, ticks * tick))
         time.sleep(0.5)
 
 
@@ -100,16 +105,23 @@ def fly(folder: Path, count: int) -> None:
     words = ["run", "-m", *FLIGHT, f"seed=range({count})", f"folder={folder}"]
     words += ["launcher=joblib", "hydra.launcher.n_jobs=2"]
     print(f"load before it: {os.getloadavg()[0]:.1f}")
-    memory: list[Memory] = []
-    output, seconds, _ = gpmpc(*words, memory=memory)
+    samples: list[Sample] = []
+    start = time.time()
+    output, seconds, _ = gpmpc(*words, samples=samples)
+    end = time.time()
     print(output.splitlines()[-1])
     begun = [path.stat().st_mtime for path in folder.glob("*/config.yaml")]
     ended = [path.stat().st_mtime for path in folder.glob("*/metrics.json")]
+    plan = max(path.stat().st_mtime for path in folder.glob("sweep-*.json"))
+    print(f"{seconds:.1f} s in all")
+    print(f"{plan - start:.1f} s until the sweep was planned, and its settings tried")
+    before = [each.processor_time for each in samples if each.time < min(begun)]
     print(
-        f"{seconds:.1f} s in all, {seconds - (max(ended) - min(begun)):.1f} s of them"
+        f"{min(begun) - start:.1f} s until the first run began, "
+        f"{before[-1]:.1f} s of the driver's processor"
     )
-    print("before the first run and behind the last")
-    flying = [each for each in memory if min(begun) <= each.time <= max(ended)]
+    print(f"{end - max(ended):.1f} s behind the last")
+    flying = [each for each in samples if min(begun) <= each.time <= max(ended)]
     megabytes = [each.megabytes for each in flying]
     print(
         f"driver: {megabytes[0]:.0f} MB when the first run began, "

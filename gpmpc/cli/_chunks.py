@@ -17,9 +17,7 @@ from statistics import median
 
 from omegaconf.errors import OmegaConfBaseException
 
-from gpmpc._compiling import report_compilation
 from gpmpc.cli._composing import ComposedSettings
-from gpmpc.cli._run import RunSettings, run_one
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.studies._run_folder import Busy, RunFolder
 
@@ -90,15 +88,19 @@ def fly_chunk(chunk: Chunk) -> None:
         raise GpmpcError("; ".join(problems))
 
 
-@report_compilation()
 def _fly_job(job: Job) -> None:
+    # Loads what flies, for seconds; who only hands out chunks does not need it.
+    from gpmpc._compiling import report_compilation
+    from gpmpc.cli._run import RunSettings, run_one
+
     settings = RunSettings(
         config=job.settings.config(),
         options=job.settings.options,
         choices=job.choices,
         folder=job.folder,
     )
-    run_one(settings, wait=False)
+    with report_compilation():
+        run_one(settings, wait=False)
 
 
 class Chunking:

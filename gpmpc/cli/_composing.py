@@ -23,8 +23,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gpmpc.cli._experiment import ASIDE, chosen_options, model_fingerprint
 from gpmpc.cli._overrides import Override, read_override
+from gpmpc.cli._plain_settings import ASIDE, chosen_options, model_fingerprint
 from gpmpc.cli._settings import without_hydra
 
 # Such as ${hydra:job.name}, which differs from run to run.

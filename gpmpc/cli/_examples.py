@@ -12,6 +12,9 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from gpmpc.cli._chunks import Job
+from gpmpc.cli._composing import ComposedSettings
+from gpmpc.cli._mistakes import explain
+from gpmpc.exceptions import GpmpcError
 
 _MOST_OTHERS = 20  # values that are tried beside choices and ends of ranges
 
@@ -66,6 +69,27 @@ class Examples:
                     greatest[kind] = job
                 self._ends[kind] = min(low, value), max(high, value)
         return [*least.values(), *greatest.values()]
+
+
+def try_settings(settings: Sequence[ComposedSettings]) -> None:
+    """Makes the objects of some runs, in whichever process a launcher has for it.
+
+    Raises:
+        GpmpcError: They cannot be made; the mistake is told in one line.
+    """
+    # Loads what flies, for seconds.
+    from gpmpc._compiling import report_compilation
+    from gpmpc.cli._experiment import experiment_of
+
+    with report_compilation():
+        for each in settings:
+            try:
+                experiment_of(each.config())
+            except Exception as error:
+                message = explain(error, "run")
+                if message is None:
+                    raise
+                raise GpmpcError(message) from error
 
 
 def _values(job: Job) -> list[tuple[str, str]]:

@@ -5,11 +5,9 @@
 Those that a user gives may call anything; those out of a file are checked first.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from hashlib import sha256
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 from hydra.utils import instantiate
@@ -17,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.cli._folders import folder_of
+from gpmpc.cli._plain_settings import plain_data
 from gpmpc.cli._recorded_settings import checked_settings
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.logs import SavedModel
@@ -24,18 +23,6 @@ from gpmpc.simulation import Noise
 from gpmpc.studies.flight import Experiment
 from gpmpc.systems import System
 
-#: settings that a result does not depend on
-ASIDE = ("launcher", "retries", "chunk", "folder", "live", "tracker")
-_GROUPS = (
-    "data",
-    "trajectory",
-    "system",
-    "model",
-    "controller",
-    "propagation",
-    "solver",
-    "learning",
-)
 _NEEDED_GROUPS = ("data", "trajectory", "system", "model", "controller")
 # Settings that no object takes, and their values.
 _CHOICES = {
@@ -62,37 +49,6 @@ def experiment_of_file(settings: dict[str, Any], trusted: Sequence[str]) -> Expe
     """
     merged = plain_data(_merge(DictConfig(settings)))
     return _build(DictConfig(checked_settings(merged, trusted)))
-
-
-def plain_data(config: DictConfig) -> dict[str, Any]:
-    """Returns settings with everything resolved."""
-    data: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    return data
-
-
-def plain_settings(config: DictConfig, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns all that a result depends on, as plain data.
-
-    Args:
-        config: The settings.
-        options: The chosen option by group, which is kept under ``options``.
-    """
-    settings = plain_data(config)
-    path = settings["model"].get("path")
-    if path:
-        settings["model"]["sha256"] = model_fingerprint(path)
-    settings = {key: value for key, value in settings.items() if key not in ASIDE}
-    return settings | {"options": chosen_options(options)}
-
-
-def model_fingerprint(path: str) -> str:
-    """Returns digits that differ where a model's file does."""
-    return sha256(Path(path).read_bytes()).hexdigest()
-
-
-def chosen_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the chosen option of each group that a result depends on."""
-    return {group: options.get(group) for group in _GROUPS}
 
 
 def _merge(config: DictConfig) -> DictConfig:

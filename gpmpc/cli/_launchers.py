@@ -25,7 +25,7 @@ from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.backend import resource_tracker
 from omegaconf import DictConfig, OmegaConf
 
-from gpmpc.exceptions import SettingError, check_number
+from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.parallel import children_ignore_interrupts, end_with
 from gpmpc.studies._run_folder import RunFolder
 
@@ -88,6 +88,13 @@ class Launcher(Protocol):
         """Keeps other sweeps of this tree from launching inside."""
         ...
 
+    def call(self, function: Work, argument: Any) -> None:
+        """Calls a function that needs what flies, where that is loaded anyway.
+
+        Its exceptions come back as they are.
+        """
+        ...
+
     def running(self, paths: Set[str]) -> Sequence[Chunk]:
         """Returns chunks of another call whose end nobody has seen yet.
 
@@ -136,6 +143,9 @@ class Basic:
     def turn(self) -> AbstractContextManager[object]:
         return nullcontext()
 
+    def call(self, function: Work, argument: Any) -> None:
+        function(argument)
+
     def running(self, paths: Set[str]) -> Sequence[Chunk]:
         return ()
 
@@ -173,6 +183,21 @@ class Joblib:
 
     def turn(self) -> AbstractContextManager[object]:
         return nullcontext()
+
+    def call(self, function: Work, argument: Any) -> None:
+        """Calls it in a process that flies chunks later."""
+        if not self._idle:
+            self._idle.append(_new_executor())
+        with children_ignore_interrupts():
+            future = self._idle[-1].submit(function, argument)
+        try:
+            future.result()
+        except BrokenExecutor as error:
+            self._idle.pop().shutdown(wait=False, kill_workers=True)
+            raise GpmpcError(
+                "a process that tried the settings died: by a crash, for want of "
+                "memory, or by hand"
+            ) from error
 
     def running(self, paths: Set[str]) -> Sequence[Chunk]:
         return ()

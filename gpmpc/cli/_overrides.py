@@ -9,7 +9,7 @@ from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from gpmpc.cli._experiment import ASIDE
+from gpmpc.cli._plain_settings import ASIDE
 from gpmpc.exceptions import SettingError
 
 # Hydra's parser reads such a word as it stands; it takes a tenth of a millisecond.

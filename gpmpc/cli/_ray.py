@@ -57,6 +57,9 @@ class Ray:
     def turn(self) -> AbstractContextManager[object]:
         return nullcontext()
 
+    def call(self, function: Work, argument: Any) -> None:
+        function(argument)
+
     def running(self, paths: Set[str]) -> Sequence[Chunk]:
         """Returns none: Ray ends the tasks of a sweep that is killed."""
         return ()

@@ -20,11 +20,12 @@ from rich.console import Console
 
 from gpmpc._compiling import report_compilation
 from gpmpc.cli._commands import Result
-from gpmpc.cli._experiment import experiment_of, plain_settings
+from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import folder_of, writing
 from gpmpc.cli._mistakes import one_line
 from gpmpc.cli._mlflow import log_to_mlflow
 from gpmpc.cli._overrides import choices
+from gpmpc.cli._plain_settings import plain_settings
 from gpmpc.cli._terminal import print_error, remarks_to
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.recording import McapRecorder, RecordedSystem

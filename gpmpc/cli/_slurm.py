@@ -164,6 +164,9 @@ class Slurm:
         self._logs.mkdir(parents=True, exist_ok=True)
         return FileLock(self._logs / "lock")
 
+    def call(self, function: Work, argument: Any) -> None:
+        function(argument)
+
     def running(self, paths: Set[str]) -> Sequence[Chunk]:
         """Returns chunks of arrays whose end nobody has seen yet."""
         self._adopted = []

@@ -18,8 +18,9 @@ from rich.console import Console
 
 from gpmpc._provenance import provenance
 from gpmpc.cli._commands import Result
-from gpmpc.cli._experiment import experiment_of, plain_data, plain_settings
+from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import folder_of, write_files, writing
+from gpmpc.cli._plain_settings import plain_data, plain_settings
 from gpmpc.cli._terminal import logging_console, progress_bar
 from gpmpc.exceptions import SettingError
 from gpmpc.studies._document import json_text, terminal

@@ -24,16 +24,15 @@ from typing import Any, NamedTuple
 import hydra
 from rich.console import Console
 
-from gpmpc._compiling import report_compilation
 from gpmpc.cli._chunks import Chunking, Job, fly_chunk
 from gpmpc.cli._commands import Result
 from gpmpc.cli._composing import Composer
-from gpmpc.cli._examples import Examples
-from gpmpc.cli._experiment import experiment_of, plain_settings
+from gpmpc.cli._examples import Examples, try_settings
 from gpmpc.cli._flying import Flying
 from gpmpc.cli._folders import folder_of, write_files
 from gpmpc.cli._launchers import launcher_of
 from gpmpc.cli._overrides import choices, combinations
+from gpmpc.cli._plain_settings import plain_settings
 from gpmpc.cli._terminal import print_error, progress_bar
 from gpmpc.exceptions import check_number
 from gpmpc.studies._index import RunIndex
@@ -115,9 +114,9 @@ class Sweep:
                 finished.append(job)
             else:
                 waiting.append(job)
-        with report_compilation():
-            for job in self._examples.of(waiting):
-                experiment_of(job.settings.config())
+        examples = self._examples.of(waiting)
+        if examples:
+            self._launcher.call(try_settings, [job.settings for job in examples])
         with self.console.status(
             f"comparing the settings of {len(finished)} finished runs"
         ):

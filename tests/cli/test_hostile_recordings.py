@@ -11,7 +11,7 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from gpmpc.cli._experiment import plain_data
+from gpmpc.cli._plain_settings import plain_data
 from gpmpc.cli._recorded import errors_of_settings, experiment_of_run
 from gpmpc.cli._recorded_settings import checked_settings, read_settings
 from gpmpc.cli._settings import compose, settings
