@@ -56,7 +56,10 @@ def test_gp_modules_load_no_optimiser_settings_or_figures():
             "gpmpc.recording",
             ["torch", "numba", "scipy", "hydra", "matplotlib", "pandas"],
         ),
-        ("gpmpc.cli._report, gpmpc.cli._status", ["torch", "numba", "casadi"]),
+        (
+            "gpmpc.cli._report, gpmpc.cli._status, gpmpc.cli._sweep",
+            ["torch", "numba", "casadi"],
+        ),
     ],
 )
 def test_reading_runs_needs_neither_torch_nor_compilers(modules, forbidden):

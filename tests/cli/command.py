@@ -17,6 +17,7 @@ IMPORTED = [
     "gpmpc.recording",
 ]
 IMPORTED += [
+    "gpmpc.cli._run",
     "gpmpc.cli._sweep",
     "gpmpc.experiments.figures",
     "gpmpc.experiments.tables",
