@@ -128,8 +128,7 @@ def _saved_model(train: Any, system: System) -> DynamicsModel | None:
     """Returns the model out of a file; None where the settings train one."""
     if not isinstance(train, SavedModel):
         return None
-    train.check(system)
-    return train.model
+    return train.model_for(system)
 
 
 def _complete_controller(controller: DictConfig, system: System) -> None:

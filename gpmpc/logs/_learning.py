@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gpmpc._dynamics import Array
-from gpmpc.exceptions import check_kind, check_number
+from gpmpc.exceptions import SettingError, check_kind, check_number
 from gpmpc.gp._wrapped import warn_of_turns
 from gpmpc.logs._comparison import Comparison
 from gpmpc.logs._control_fitness import ControlFitness, judge_for_control
@@ -26,6 +26,7 @@ from gpmpc.logs._search import PAST_ROWS, Search
 from gpmpc.logs._structures import Candidate
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel
+from gpmpc.models._namings import NO_NAMINGS, Namings
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,8 @@ class IdentifiedModel:
     comparisons: tuple[Comparison, ...] = ()
     #: whether a controller can plan with it, where that was asked; no file keeps it
     control: ControlFitness | None = None
+    #: what a system that it flies may call its states and inputs
+    namings: Namings = NO_NAMINGS
 
 
 def learn(
@@ -81,7 +84,8 @@ def learn(
             correction by the past. Judges what the inputs do.
 
     Raises:
-        SettingError: ``log`` is no log, or a setting is out of range.
+        SettingError: ``log`` is no log, or a setting is out of range, or a model for
+            control has no input.
         DataError: The log is too short for rollouts of that many steps.
         TrainingError: A GP could not be trained.
 
@@ -92,6 +96,9 @@ def learn(
     check_number("points", points, least=10, whole=True)
     check_number("steps", steps, least=2, whole=True)
     check_number("seed", seed, least=0, whole=True)
+    if for_control and not log.input_names:
+        rule = "needs inputs that a controller can set; the mapping names none"
+        raise SettingError("for_control", rule)
     advice = "Say kind: angle of it in the mapping"
     warn_of_turns(log.transitions(), log.space.angles, advice)
     folds = split_folds(log, PAST_ROWS, steps)
@@ -143,6 +150,7 @@ def _identify(
         folds=folds,
         comparisons=comparisons,
         control=control,
+        namings=log.mapping.namings,
     )
 
 

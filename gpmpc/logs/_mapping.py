@@ -21,6 +21,7 @@ from gpmpc.exceptions import (
 from gpmpc.logs._mapping_text import load_mapping_text
 from gpmpc.logs._nominal_system import NominalSystem
 from gpmpc.logs._units import Conversion, conversion
+from gpmpc.models._namings import Namings
 from gpmpc.models._state_space import StateGroup, StateSpace
 
 Role = Literal["states", "inputs", "context"]
@@ -379,13 +380,43 @@ class LogMapping:
             name if factor == 1 else f"{name} times {factor:.6g}"
             for name, factor in zip(signal.columns, signal.factors, strict=True)
         ]
+        names = self._in_order_of_states(signal, names)
+        if self._turns_axes(signal):
+            names = [f"{name} in other axes" for name in names]
+        return names
+
+    def _in_order_of_states(self, signal: Signal, names: list[str]) -> list[str]:
+        """Returns names of a signal's columns in the order that they come out in."""
         if signal.kind == "quaternion" and signal.order == "wxyz":
             names = [*names[1:], names[0]]
         if self._swaps_east_and_north(signal):
             names = [names[1], names[0], names[2]]
-        if self._turns_axes(signal):
-            names = [f"{name} in other axes" for name in names]
         return names
+
+    @property
+    def namings(self) -> Namings:
+        """What states and inputs may be called: as columns, as entries, as signals."""
+        return Namings(self._namings_of("states"), self._namings_of("inputs"))
+
+    def _namings_of(self, role: Role) -> tuple[tuple[str, ...], ...]:
+        """Returns ways to call the entries of one role, which are different names each.
+
+        They are the columns, the entries of the signals, and the signals' own names
+        where these have one entry.
+        """
+        by_column: list[str] = []
+        by_entry: list[str] = []
+        by_signal: list[str] = []
+        for signal in self.of(role):
+            is_euler = signal.kind == "euler"
+            columns = signal.group.entries if is_euler else signal.entries
+            group = self._group(signal) if role == "states" else signal.group
+            entries = group.entries
+            by_column += self._in_order_of_states(signal, list(columns))
+            by_entry += entries
+            by_signal += [signal.name] if len(entries) == 1 else entries
+        ways = dict.fromkeys(map(tuple, (by_column, by_entry, by_signal)))
+        return tuple(names for names in ways if len(set(names)) == len(names))
 
     def axes_of(self, signal: Signal) -> str:
         """Returns the axes of a rigid body's state in the file: "enu" or "ned"."""

@@ -5,7 +5,7 @@ it in the file, is stored here.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,8 @@ from gpmpc.logs._comparison import Comparison
 from gpmpc.logs._fitting import NominalFit
 from gpmpc.logs._learning import IdentifiedModel
 from gpmpc.logs._structures import Candidate
-from gpmpc.models import load_model
+from gpmpc.models import LogDynamics, load_model
+from gpmpc.models._namings import order_by_name
 from gpmpc.models._older_files import signals_of_metadata
 from gpmpc.models._past import first_signals, measured_dim
 from gpmpc.models._stored_log_model import (
@@ -58,6 +59,7 @@ def save_learned(learned: IdentifiedModel, path: str | Path) -> None:
         input_names=learned.input_names,
         context_names=learned.context_names,
         time_step=learned.time_step,
+        namings=learned.namings,
     )
     header, tensors = log_model_parts(path, named)
     header["names"].append(learned.runs)
@@ -135,6 +137,7 @@ def _learned_of_parts(
             Comparison(str(name), np.array(ratio), np.array(low), np.array(high))
             for name, ratio, low, high in header.get("comparisons", ())
         ),
+        namings=named.namings,
     )
 
 
@@ -153,13 +156,41 @@ class SavedModel:
     def check(self, system: System) -> None:
         """Raises ``SettingError`` unless signals and time step are a system's."""
         model = self.model
-        signals = self.signals
+        signals = self._signals_for(system)
         measured = measured_dim(model)
         self._check_size("states", measured, signals.state_names, system)
         self._check_size("inputs", model.input_dim, signals.input_names, system)
         first_signals(signals, measured).check(
             self.path, system.signals, system.name, "model"
         )
+
+    def model_for(self, system: System) -> DynamicsModel:
+        """Returns the model, whose states and inputs are called as a system's.
+
+        Raises:
+            SettingError: Its signals and time step are not the system's.
+        """
+        self.check(system)
+        signals = self._signals_for(system)
+        if isinstance(self.model, LogDynamics) and signals != self.signals:
+            return replace(self.model, signals=signals)
+        return self.model
+
+    def _signals_for(self, system: System) -> Signals:
+        """Returns the signals, called as a system's where a log may call them so."""
+        if not isinstance(self.model, LogDynamics):
+            return self.signals
+        namings = self.model.namings
+        names = {
+            "state_names": (system.state_names, namings.states),
+            "input_names": (system.input_names, namings.inputs),
+        }
+        systems_own = {
+            key: own
+            for key, (own, ways) in names.items()
+            if order_by_name(own, ways) == list(range(len(own)))
+        }
+        return replace(self.signals, **systems_own)
 
     def _check_size(
         self, key: str, dim: int, names: Sequence[str], system: System

@@ -105,6 +105,7 @@ def _nominal_of_vehicle(log: Log) -> SystemNominal:
         state_names=log.space.names,
         input_names=log.input_names,
         fixed=fixed,
+        namings=log.mapping.namings,
     )
 
 
@@ -146,6 +147,7 @@ def _nominal_of_user(system: NominalSystem, log: Log) -> SystemNominal:
         state_names=log.space.names,
         input_names=log.input_names,
         fixed=system.fixed,
+        namings=log.mapping.namings,
     )
 
 

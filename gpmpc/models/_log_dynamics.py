@@ -23,6 +23,7 @@ from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models._log_linearization import DIFFERENCE, LogLinearizer
 from gpmpc.models._log_model import LogModel
+from gpmpc.models._namings import NO_NAMINGS, Namings
 from gpmpc.models._past import states_along
 from gpmpc.signals import UNKNOWN, Signals
 
@@ -59,6 +60,8 @@ class LogDynamics:
     #: smallest and largest measured states and inputs of the log (2, n + m), where they
     #: are known
     ranges: Array | None = None
+    #: what a system that it flies may call its measured states and inputs
+    namings: Namings = NO_NAMINGS
     dtype = torch.float64
     device = torch.device("cpu")
 

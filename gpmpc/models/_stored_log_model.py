@@ -33,7 +33,8 @@ from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
 from gpmpc.models._log_dynamics import TIME_CONSTANTS, LogDynamics, OutputNoise
 from gpmpc.models._log_model import LogModel, OutputGP
 from gpmpc.models._memory import NO_MEMORY, Memory
-from gpmpc.models._older_files import STILL
+from gpmpc.models._namings import NO_NAMINGS, Namings
+from gpmpc.models._older_files import STILL, namings_of_columns
 from gpmpc.models._parametric import AffineNominal, MultirotorNominal
 from gpmpc.models._state_space import StateGroup, StateSpace
 from gpmpc.models._stored_functions import check_code_name
@@ -65,6 +66,7 @@ class NamedLogModel(NamedTuple):
     input_names: tuple[str, ...]
     context_names: tuple[str, ...]
     time_step: float
+    namings: Namings = NO_NAMINGS  # what states and inputs may be called
 
 
 def log_model_parts(
@@ -99,6 +101,8 @@ def log_model_parts(
         "names": [named.state_names, named.input_names, named.context_names],
         "time_step": named.time_step,
     }
+    if named.namings != NO_NAMINGS:
+        header["namings"] = named.namings._asdict()
     if model.correction is not None:
         header["correction"] = model.correction.steps
     for name, part in _regressions(model).items():
@@ -163,8 +167,13 @@ def read_log_dynamics(path: Path, trusted: Sequence[str] = ()) -> LogDynamics:
         input_dim=len(named.input_names),
         time_step=named.time_step,
         noise=named.noise,
-        signals=Signals(named.state_names, named.input_names, named.time_step),
+        signals=Signals(
+            state_names=named.namings.first_states,
+            input_names=named.namings.first_inputs,
+            time_step=named.time_step,
+        ),
         ranges=tensors["ranges"].numpy() if "ranges" in tensors else None,
+        namings=named.namings,
     )
 
 
@@ -180,14 +189,21 @@ def log_model_of_parts(
         DataError: The parts do not belong together.
     """
     state_values, input_values, context_values, *_ = header["names"]
+    state_names = texts("state_names", state_values)
+    input_names = texts("input_names", input_values)
     kinematics = _kinematics(header["kinematics"], _space(header["groups"]))
+    namings = namings_of_columns(kinematics.space, state_names, input_names)
+    if "namings" in header:
+        sizes = (kinematics.space.dim, len(input_names))
+        namings = _namings(header["namings"], *sizes)
     log = _LogOfModel(
         path=path,
         kinematics=kinematics,
-        state_names=texts("state_names", state_values),
-        input_names=texts("input_names", input_values),
+        state_names=state_names,
+        input_names=input_names,
         context_names=texts("context_names", context_values),
         time_step=header["time_step"],
+        namings=namings,
         trusted=tuple(trusted),
     )
     model = _model(header, tensors, log)
@@ -203,9 +219,26 @@ def log_model_of_parts(
         input_names=log.input_names,
         context_names=log.context_names,
         time_step=log.time_step,
+        namings=namings,
     )
     _check_named(named)
     return named
+
+
+def _namings(fields: Any, states: int, inputs: int) -> Namings:
+    """Reads what states and inputs may be called.
+
+    Raises:
+        DataError: They are other numbers of names, or two are the same.
+    """
+    ways: dict[str, tuple[tuple[str, ...], ...]] = {}
+    for role, count in (("states", states), ("inputs", inputs)):
+        ways[role] = tuple(texts("namings", names) for names in fields[role])
+        for names in ways[role]:
+            if len(names) != count or len(set(names)) < count:
+                rule = f"namings must be {count} different {role}"
+                raise DataError(f"{rule}; got {names!r:.80}")
+    return Namings(**ways)
 
 
 def _model(
@@ -325,6 +358,7 @@ class _LogOfModel(NamedTuple):
     input_names: tuple[str, ...]
     context_names: tuple[str, ...]
     time_step: float
+    namings: Namings
     trusted: tuple[str, ...]
 
 
@@ -379,6 +413,10 @@ def _system_nominal(settings: Mapping[str, Any], log: _LogOfModel) -> SystemNomi
     if not isinstance(log.kinematics, Increments):
         raise DataError("the states of a system are no rigid body's")
     fixed = settings["fixed"]
+    # Older files do not say how the system calls what the fit took.
+    states = settings.get("states", list(log.kinematics.space.names))
+    columns = log.namings.first_inputs or log.input_names
+    inputs = settings.get("inputs", list(columns))
     for name, value in fixed.items():
         if not isinstance(value, bool | int | float | str):
             raise DataError(f"fixed.{name} must be a number or a text")
@@ -395,8 +433,8 @@ def _system_nominal(settings: Mapping[str, Any], log: _LogOfModel) -> SystemNomi
             for name, start, low, high in settings["fitted"]
         ),
         time_step=log.time_step,
-        state_names=log.state_names,
-        input_names=log.input_names,
+        state_names=texts("states", states),
+        input_names=texts("inputs", inputs),
         fixed=fixed,
     )
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
+from gpmpc.models._namings import NO_NAMINGS, Namings, order_by_name
 from gpmpc.systems import System
 
 _TIME_STEP = "time_step"  # argument of factories that is no parameter
@@ -31,7 +32,7 @@ class FittedParameter:
     """A parameter that is fitted, and where.
 
     Raises:
-        SettingError: ``start`` does not lie between the bounds.
+        SettingError: ``start`` does not lie between the bounds, or these are one.
     """
 
     name: str
@@ -45,6 +46,12 @@ class FittedParameter:
                 f"nominal.parameters.{self.name}",
                 f"must start between {self.low:g} and {self.high:g}; "
                 f"got {self.start:g}",
+            )
+        if self.low == self.high:
+            raise SettingError(
+                f"nominal.parameters.{self.name}",
+                f"must have a low below its high, or stand under fixed; got "
+                f"{self.low:g} twice",
             )
 
 
@@ -64,6 +71,7 @@ class SystemNominal:
     state_names: tuple[str, ...]  #: of the log (n,)
     input_names: tuple[str, ...]  #: of the log (m,)
     fixed: Mapping[str, Any] = field(default_factory=dict)  #: its other arguments
+    namings: Namings = NO_NAMINGS  #: other names of these states and inputs
 
     def __post_init__(self) -> None:
         for kind, own, names in (
@@ -96,7 +104,11 @@ class SystemNominal:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What a file holds of it; an infinite bound is None."""
+        """What a file holds of it; an infinite bound is None.
+
+        The states and inputs of the log are called as the system calls them, so that
+        what is read from the file takes them as the fit did.
+        """
         finite = [
             [
                 parameter.name,
@@ -108,7 +120,13 @@ class SystemNominal:
             ]
             for parameter in self.fitted
         ]
-        return {"code": self.code, "fitted": finite, "fixed": dict(self.fixed)}
+        return {
+            "code": self.code,
+            "fitted": finite,
+            "fixed": dict(self.fixed),
+            "states": _placed(self._system.state_names, self._state_order),
+            "inputs": _placed(self._system.input_names, self._input_order),
+        }
 
     def outputs(
         self, theta: Any, states: Array, inputs: Array, context: Array
@@ -128,11 +146,13 @@ class SystemNominal:
     @cached_property
     def _state_order(self) -> list[int]:
         """Where each state of the system stands in the log."""
-        return _order(self._system.state_names, self.state_names)
+        namings = (self.state_names, *self.namings.states)
+        return _order(self._system.state_names, namings)
 
     @cached_property
     def _input_order(self) -> list[int]:
-        return _order(self._system.input_names, self.input_names)
+        namings = (self.input_names, *self.namings.inputs)
+        return _order(self._system.input_names, namings)
 
     def _system_of(self, values: Sequence[Any]) -> System:
         """Makes the system of parameters, by its factory; the last ones are kept."""
@@ -305,12 +325,15 @@ def usual_bounds(
     return (-np.inf, np.inf)
 
 
-def _order(own: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Returns where each own name stands among names: by name, or else as they stand.
+def _order(own: Sequence[str], namings: Sequence[Sequence[str]]) -> list[int]:
+    """Returns where each own name stands in the log: by name, or else as they stand."""
+    order = order_by_name(own, namings)
+    return list(range(len(own))) if order is None else order
 
-    Names such as "state.angle" count as "angle".
-    """
-    plain = [name.rpartition(".")[2] for name in names]
-    if sorted(own) == sorted(plain):
-        return [plain.index(name) for name in own]
-    return list(range(len(own)))
+
+def _placed(own: Sequence[str], order: Sequence[int]) -> list[str]:
+    """Returns own names in the order of the log."""
+    names = [""] * len(own)
+    for name, place in zip(own, order, strict=True):
+        names[place] = name
+    return names

@@ -3,6 +3,7 @@
 import importlib.util
 import re
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import torch
 import yaml
 
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.gp._storage import write_model
+from gpmpc.gp._storage import read_model, write_model
 from gpmpc.logs import (
     LogMapping,
     fit_nominal,
@@ -33,6 +34,7 @@ from gpmpc.models._system_nominal import FittedParameter, SystemNominal
 from gpmpc.systems import (
     KinematicBicycle,
     System,
+    cart_pole,
     differential_drive,
     dynamic_bicycle,
     kinematic_bicycle,
@@ -376,6 +378,82 @@ def test_a_file_names_the_users_code_and_reads_it_only_where_it_is_trusted(arm):
     check_model(saved.model, torch.from_numpy(states), torch.from_numpy(inputs))
     predicted = saved.model.linearize(states, inputs).mean
     np.testing.assert_allclose(predicted, truth, atol=2e-3)
+
+
+def saved_start(folder, states, inputs):
+    """A pendulum's start as a file of a log in degrees, and the model before it."""
+    mapping = {"time": "t", "rest": "use", "states": states, "inputs": inputs}
+    columns = {"gyro": "rate", "theta": "angle", "volt": "torque"}
+    table = pandas.read_csv(folder / "log.csv")
+    table = table.assign(**{new: table[old] for new, old in columns.items()})
+    log = log_of(folder, table, {**mapping, "nominal": "gpmpc.systems:pendulum"})
+    model = bases(log)[0].model
+    model = replace(model, theta=model.nominal.start)
+    noise = OutputNoise(np.ones((4, 2)), np.ones(2))
+    names = [log.mapping.column_names(role) for role in ("states", "inputs")]
+    named = NamedLogModel(model, noise, *names, (), log.time_step, log.mapping.namings)
+    path = folder / "model.safetensors"
+    write_model(path, LOG_MODEL, *log_model_parts(path, named))
+    return path, model
+
+
+TORQUE = {"torque": {"columns": ["torque"], "scale": 2}}
+
+
+@pytest.mark.parametrize("older", [False, True])
+@pytest.mark.parametrize("keys", [("rate", "angle"), ("gyro", "theta"), ("a", "b")])
+def test_a_file_takes_the_states_as_the_fit_did(arm, keys, older):
+    """They stand in the log the other way round than in the system."""
+    names = ("gyro", "theta") if keys == ("rate", "angle") else ("rate", "angle")
+    if older:  # keys did not count then
+        names = ("rate", "angle")
+    columns = [{"columns": [name], "unit": "deg"} for name in names]
+    path, model = saved_start(arm, dict(zip(keys, columns, strict=True)), TORQUE)
+    if older:  # as files were that did not say what the system calls its states
+        header, tensors = read_model(path, LOG_MODEL)
+        del header["namings"]
+        for role in ("states", "inputs"):
+            del header["nominal"][1][role]
+        write_model(path, LOG_MODEL, header, tensors)
+    loaded = load_flyable(path).model.model
+    x = np.array([[0.3, 1.2], [-2.0, 0.1]])
+    u = np.array([[0.4], [-1.0]])
+    rates = model.outputs(x, u, np.empty((2, 0)))
+    np.testing.assert_array_equal(loaded.outputs(x, u, np.empty((2, 0))), rates)
+    after = [step(pendulum(), pair[::-1], v) for pair, v in zip(x, u, strict=True)]
+    np.testing.assert_allclose(x + 0.05 * rates, np.array(after)[:, ::-1], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("states", "inputs"),
+    [
+        ({"a": {"columns": ["angle"], "unit": "deg"}, "w": ["rate"]}, TORQUE),
+        ({"angle": {"columns": ["theta"], "unit": "deg"}, "rate": ["rate"]}, TORQUE),
+        (
+            {"state": {"columns": ["angle", "rate"], "unit": "deg"}},
+            {"torque": ["volt"]},
+        ),
+    ],
+)
+def test_a_log_in_other_units_flies_what_its_columns_or_keys_name(arm, states, inputs):
+    path, _ = saved_start(arm, states, inputs)
+    saved = load_flyable(path)
+    plant = pendulum()
+    flown = saved.model_for(plant).signals
+    assert flown.state_names == plant.state_names
+    assert flown.input_names == plant.input_names
+    with pytest.raises(SettingError, match=r"has the states .*; cart_pole has"):
+        saved.check(cart_pole())
+    with pytest.raises(SettingError, match="; Backwards has rate, angle"):
+        saved.check(System(Backwards(), plant.time_step))
+
+
+class Backwards:
+    state_names = ("rate", "angle")
+    input_names = ("torque",)
+
+    def derivative(self, x, u):
+        return [u[0] - x[1], x[0]]
 
 
 @pytest.mark.slow
