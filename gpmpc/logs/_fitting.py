@@ -83,7 +83,8 @@ def fit_nominal(
     theta0 = np.concatenate([theta0, np.full(lags, _FIRST_TIME_CONSTANT)])
     if not len(theta0):
         return NominalFit(replace(model, theta=theta0), standard_errors=theta0)
-    residuals = _RolloutResiduals(model, windows, steps)
+    bounds = _bounds(model, lags)
+    residuals = _RolloutResiduals(model, windows, steps, bounds)
     with np.errstate(over="ignore", invalid="ignore"):
         if not (np.abs(residuals(theta0)) < _DIVERGED).all():
             rule = "begin nearer, or with fewer steps"
@@ -92,7 +93,7 @@ def fit_nominal(
             residuals,
             theta0,
             residuals.jacobian,
-            bounds=_bounds(model, lags),
+            bounds=bounds,
             loss="soft_l1",
             x_scale="jac",
             xtol=1e-4,
@@ -120,7 +121,14 @@ def _bounds(model: LogModel, lags: int) -> tuple[Array, Array]:
 class _RolloutResiduals:
     """Errors of a model's rollouts as a function of its parameters, without units."""
 
-    def __init__(self, model: LogModel, windows: Windows, steps: int):
+    def __init__(
+        self,
+        model: LogModel,
+        windows: Windows,
+        steps: int,
+        bounds: tuple[Array, Array],
+    ):
+        self._low, self._high = bounds
         self._model = model
         self._windows = windows
         self._steps = steps
@@ -149,9 +157,14 @@ class _RolloutResiduals:
     def jacobian(self, theta: Array) -> Array:
         """Computes the derivatives of the residuals by the parameters, a column each.
 
-        By forward differences of one batch.
+        By differences of one batch, forward, or backward at an upper bound: a system
+        may refuse what lies beyond it.
         """
         h = 1e-5 * np.maximum(np.abs(theta), 1.0)
+        above = self._high - theta
+        below = theta - self._low
+        h = np.minimum(h, np.maximum(above, below))
+        h = np.where(h <= above, h, -h)
         displaced = theta + np.diag(h)
         residuals = self.of_windows(np.concatenate([displaced, theta[None]]))
         differences = residuals[:-1] - residuals[-1]

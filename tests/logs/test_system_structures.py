@@ -310,6 +310,27 @@ def test_start_bounds_and_fixed_arguments_are_the_mappings(arm):
     assert structure.model.nominal.fixed == {"damping": 0.1}
 
 
+CAPPED = """
+
+@dataclass(frozen=True)
+class Capped(Arm):
+    def __post_init__(self):
+        if self.length > 0.95:
+            raise ValueError("must be short")
+        super().__post_init__()
+"""
+
+
+def test_values_that_a_system_refuses_beyond_a_bound_are_not_tried(arm):
+    (arm / "my_robot.py").write_text(ARM + CAPPED)
+    length = {"start": 0.95, "low": 0.5, "high": 0.95}
+    entry = {"system": "my_robot:Capped", "parameters": {"length": length, "mass": 1}}
+    log = read_log(arm / "log.csv", {**PENDULUM, "nominal": entry})
+    fit = fit_nominal(bases(log)[0].model, None, log, 5)
+    assert fit.model.theta[0] == pytest.approx(0.95, abs=1e-3)
+    assert (fit.standard_errors > 1e-4).all()  # tiny ones of derivatives across it
+
+
 def test_columns_in_another_order_are_found_by_their_names(arm):
     states = {"rate": ["rate"], "angle": ["angle"]}
     log = read_log(
@@ -334,6 +355,10 @@ def test_columns_in_another_order_are_found_by_their_names(arm):
         (
             {"system": "a:b", "parameters": {"m": {"start": 3, "high": 1}}},
             "parameters.m: must start between -inf and 1; got 3",
+        ),
+        (
+            {"system": "a:b", "parameters": {"m": {"start": 3, "low": 3, "high": 3}}},
+            "parameters.m: must have a low below its high, or stand under fixed",
         ),
     ],
 )
@@ -446,6 +471,17 @@ def test_a_log_in_other_units_flies_what_its_columns_or_keys_name(arm, states, i
         saved.check(cart_pole())
     with pytest.raises(SettingError, match="; Backwards has rate, angle"):
         saved.check(System(Backwards(), plant.time_step))
+
+
+def test_columns_of_one_name_are_no_names_of_a_model(arm):
+    path, _ = saved_start(arm, {"s": ["angle", "rate"]}, TORQUE)
+    header, tensors = read_model(path, LOG_MODEL)
+    header["names"][0] = ["data", "data"]
+    header["namings"]["states"] = []
+    write_model(path, LOG_MODEL, header, tensors)
+    saved = load_flyable(path)
+    assert saved.signals.state_names == ()
+    saved.check(pendulum())
 
 
 class Backwards:
