@@ -153,9 +153,19 @@ class Log:
                 "held_out",
                 f"must leave runs on both sides; got {count} of {len(names)}",
             )
-        for_learning = tuple(run for run in self.runs if run.name not in held_out)
-        for_judging = tuple(run for run in self.runs if run.name in held_out)
-        return replace(self, runs=for_learning), replace(self, runs=for_judging)
+        others = [name for name in names if name not in held_out]
+        return self._without(held_out), self._without(others)
+
+    def _without(self, names: Sequence[str]) -> "Log":
+        """Returns the log without some runs, and without what was noticed in them.
+
+        What was noticed in a file as a whole, or in a run without usable rows, stays.
+        """
+        return replace(
+            self,
+            runs=tuple(run for run in self.runs if run.name not in names),
+            findings=tuple(one for one in self.findings if one.run not in names),
+        )
 
     def split_by_time(self, share: float) -> tuple["Log", "Log"]:
         """Splits every run: into its first ``share`` of rows, and the others."""
@@ -206,12 +216,13 @@ class Log:
         check_number("past", past, least=0, whole=True)
         check_number("stride", stride, least=1, whole=True)
         if most is not None:
+            check_number("most", most, least=1, whole=True)
             stride = self._stride_for(most, rows=past + ahead)
         parts = [run.windows(past, ahead, stride) for run in self.runs]
         if not sum(len(part.times) for part in parts):
             raise DataError(
                 f"windows of {past + ahead + 1} rows need a piece as long; the longest "
-                f"has {max(self._lengths_of_pieces())}"
+                f"has {self.longest_piece}"
             )
         runs = [np.full(len(part.times), number) for number, part in enumerate(parts)]
         return Windows(
@@ -230,6 +241,11 @@ class Log:
         """Returns the stride that makes about ``most`` windows of ``rows`` + 1 rows."""
         starts = sum(max(length - rows, 0) for length in self._lengths_of_pieces())
         return max(-(-starts // most), 1)
+
+    @property
+    def longest_piece(self) -> int:
+        """Number of rows of the longest piece without a gap."""
+        return max(self._lengths_of_pieces())
 
     def _lengths_of_pieces(self) -> list[int]:
         return [end - begin for run in self.runs for begin, end in run.pieces]

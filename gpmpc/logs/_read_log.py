@@ -111,7 +111,7 @@ def _read_run_tables(
         findings.extend(file.findings)
         budget = MemoryBudget(path)  # of the rows; the reader had one of its own
         named = named_columns(path, file.tables, mapping)
-        for run, tables_of_run in _split_into_runs(path, named, mapping):
+        for run, tables_of_run in _split_into_runs(path, named, mapping, findings):
             if run in tables:
                 raise DataError(
                     f"run {run!r} comes from two files: give the files different names"
@@ -126,9 +126,12 @@ def _read_run_tables(
 
 
 def _split_into_runs(
-    path: Path, tables: Tables, mapping: LogMapping
+    path: Path, tables: Tables, mapping: LogMapping, findings: list[Finding]
 ) -> Iterator[tuple[str, Tables]]:
-    """Yields the runs of a file with their names: one, or those of the mapping."""
+    """Yields the runs of a file with their names: one, or those of the mapping.
+
+    Rows that name no run are left out, with a finding.
+    """
     if not mapping.run:
         for run, tables_of_run in runs_side_by_side(path, tables, mapping):
             yield f"{run_name(path)}:{run}" if run else run_name(path), tables_of_run
@@ -140,13 +143,19 @@ def _split_into_runs(
         )
     table = tables[""]
     check_column(str(path), table, mapping.run)
-    count = table[mapping.run].nunique()
+    names = table[mapping.run].replace(r"^\s*$", np.nan, regex=True)
+    nameless = int(names.isna().sum())
+    if nameless == len(names):
+        raise DataError(f"{path}: column {mapping.run!r} names no run in any row")
+    text = f"{nameless} rows left out: their {mapping.run} is empty"
+    RunFindings(run_name(path), findings).add("no run", nameless, text)
+    count = names.nunique()
     if count > MOST_RUNS and count > len(table) / FEWEST_ROWS:
         raise DataError(
             f"{path}: column {mapping.run!r} names {count} runs in {len(table)} rows; "
             f"a run has {FEWEST_ROWS} at least"
         )
-    for run, rows in table.groupby(mapping.run, sort=False):
+    for run, rows in table.groupby(names, sort=False):
         yield f"{run_name(path)}:{run}", {"": rows}
 
 

@@ -178,6 +178,31 @@ def test_runs_are_told_apart_by_file_or_by_column(tmp_path):
     assert [len(run) for run in log] == [100, 120]
     with pytest.raises(SettingError, match="no such run 'c'"):
         log.split(["c"])
+    both["flight"] = both["flight"].where(both["t"] > 0.3)
+    log = read_log(written(tmp_path, both), {**PENDULUM, "run": "flight"})
+    (finding,) = [one for one in log.findings if one.kind == "no run"]
+    assert (finding.run, finding.count) == ("log", 32)
+    assert [len(run) for run in log] == [84, 104]
+    nameless = written(tmp_path, both.assign(flight=" "))
+    with pytest.raises(DataError, match="column 'flight' names no run in any row"):
+        read_log(nameless, {**PENDULUM, "run": "flight"})
+
+
+def test_findings_stay_with_the_rows_that_they_are_of(tmp_path):
+    tables = [pendulum_table(100, seed) for seed in range(2)]
+    both = pandas.concat(
+        [table[table["t"] != 1.0].assign(flight=f) for f, table in enumerate(tables)]
+    )
+    both.iloc[0, both.columns.get_loc("flight")] = np.nan
+    log = read_log(written(tmp_path, both), {**PENDULUM, "run": "flight"})
+    runs = [(one.kind, one.run) for one in log.findings]
+    assert ("gap", "log:1.0") in runs
+    train, _ = log.split(["log:1.0"])
+    kept = [(one.kind, one.run) for one in train.findings]
+    assert kept == [pair for pair in runs if pair[1] != "log:1.0"]
+    assert {"log", "log:0.0"} == {run for _, run in kept}
+    for part in log.split_by_time(0.8):
+        assert part.findings == log.findings
 
 
 def test_repeated_and_backward_stamps_are_counted(tmp_path):
