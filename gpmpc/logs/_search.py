@@ -501,7 +501,9 @@ class Search:
         """Rolls a model out on held-out rows, and leaves out what diverges."""
         share = len(held_out) / len(self._log)
         windows = held_out.windows(
-            self._steps, past=PAST_ROWS, most=round(share * _CORRECTED_WINDOWS)
+            ahead=self._steps,
+            past=PAST_ROWS,
+            most=max(round(share * _CORRECTED_WINDOWS), 1),
         )
         with np.errstate(over="ignore", invalid="ignore"):
             predicted = model.rollout(windows)
@@ -618,7 +620,10 @@ class Search:
         others = dict(self._baselines)
         ranked = self._ranked(self._structures.values())
         if len(ranked) > 1:
-            others[ranked[1].name] = self._distances(self._models(ranked[1]))
+            name = ranked[1].name
+            if name in others:  # a baseline, which is fitted otherwise
+                name = f"{name}, fitted on rollouts"
+            others[name] = self._distances(self._models(ranked[1]))
         block = 2 * -(-self._steps // min(w.stride for w in self._windows))
         return tuple(
             compare(name, distances, other, block=block, seed=self._seed)

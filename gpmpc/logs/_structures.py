@@ -298,6 +298,8 @@ def _with_lags(inputs: int) -> Callable[[LogModel], LogModel | None]:
         is_still = isinstance(nominal, AffineNominal) and not nominal.fitted
         if len(model.time_constants) or (is_still and model.memory.empty):
             return None
+        if inputs == 0:
+            return None
         return replace(model, time_constants=np.zeros(inputs))
 
     return extend

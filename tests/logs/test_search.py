@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gpmpc.exceptions import SettingError
 from gpmpc.gp import train
 from gpmpc.logs import Log, LogMapping, judge, learn
 from gpmpc.logs._comparison import compare
@@ -14,7 +15,9 @@ from gpmpc.logs._control_fitness import judge_for_control
 from gpmpc.logs._folds import split_folds
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._rollout_corrections import Rollouts, choose_averages
+from gpmpc.logs._search import PAST_ROWS, Search
 from gpmpc.logs._smoothing import smooth
+from gpmpc.logs._structures import additions, bases
 from gpmpc.models import LogModel
 from gpmpc.models._correction import Correction, Prior
 from gpmpc.models._kinematics import Increments
@@ -304,6 +307,7 @@ def test_a_losing_model_says_so_first_and_ends_with_code_3(tmp_path):
     gain = np.array([-0.8, -0.9])
     states = simulate(lambda x, u: [x[1], -x[0] + x @ gain], [1, 1], [[0.0]] * 160)
     table = np.column_stack([STEP * np.arange(160), states, states @ gain])
+    table = np.insert(table, 5, table[5], axis=0)  # a stamp that comes twice
     np.savetxt(tmp_path / "a.csv", table, delimiter=",", header="t,c,T,u", comments="")
     (tmp_path / "map.yaml").write_text(
         "time: t\nrest: use\nstates: {c: [c], T: [T]}\ninputs: {u: [u]}\n"
@@ -319,7 +323,47 @@ def test_a_losing_model_says_so_first_and_ends_with_code_3(tmp_path):
     for name in ("report.md", "card.md"):
         first = (tmp_path / "learned" / name).read_text().splitlines()[0]
         assert first.startswith("# This model should not be used: u follows"), first
+    left_out = (tmp_path / "learned" / "card.md").read_text().split("Left out of")[1]
+    assert "a: repeated stamp: " in left_out
     assert "1 / 5 steps ahead" in (tmp_path / "learned" / "report.md").read_text()
+
+
+def tiny_search(log):
+    """A search whose bases were considered, and nothing else."""
+    search = Search(
+        log=log,
+        folds=split_folds(log, PAST_ROWS, 5).pair,
+        points=10,
+        steps=5,
+        seed=0,
+        progress=lambda text: None,
+        memory={},
+        for_control=False,
+    )
+    for base in bases(log):
+        search._consider_nominal(base, parent=None)
+    return search
+
+
+def test_a_runner_up_does_not_stand_for_the_baseline_of_its_name(monkeypatch):
+    search = tiny_search(reactor_log(240))
+    names = [one.name for one in search.comparisons()]
+    assert len(names) == len({*names}) == 5
+    (rival,) = [name for name in names if "fitted on rollouts" in name]
+    assert rival.partition(",")[0] in names
+    # A short run has a window, however many rows the others have.
+    monkeypatch.setattr("gpmpc.logs._search._CORRECTED_WINDOWS", 1)
+    assert all(len(one.rollouts.windows) for one in search._validate(search.best))
+
+
+def test_without_inputs_nothing_acts_through_lags():
+    mapping = LogMapping.from_dict({"states": {"c": ["c"], "T": ["T"]}})
+    log = log_of([np.zeros((50, 2))], [np.empty((50, 0))], mapping)
+    for base in bases(log):
+        extended = [base.extended(addition) for addition in additions(base)]
+        assert not [one for one in extended if one and "lags" in one.name]
+    with pytest.raises(SettingError, match="for_control: needs inputs"):
+        learn(log, for_control=True)
 
 
 @pytest.mark.parametrize("control", [False, True])
