@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from rich.console import Console
 
@@ -19,6 +20,7 @@ from gpmpc.cli._commands import Result
 from gpmpc.cli._folders import find_modules_here, write_files, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.logs import IdentifiedModel, Judgement, Log
+from gpmpc.logs._judging import check_held_out, most_steps
 from gpmpc.plotting import judgement_figure, png
 from gpmpc.studies._document import Document, Table, number, terminal
 from gpmpc.studies._run_folder import describe_code
@@ -47,6 +49,7 @@ def learn(arguments: argparse.Namespace) -> Result:
     for finding in log.findings:
         console.print(f"  {finding.run}: {finding.kind}: {finding.text}")
     train, held_out = _split(log, arguments.held_out)
+    check_held_out(held_out, arguments.steps)
     with writing(folder, "to"):
         folder.mkdir(parents=True, exist_ok=True)
         learned, judgement = _learn_and_judge(
@@ -125,8 +128,8 @@ def _learn_and_judge(
             memory=memory,
             for_control=arguments.for_control,
         )
-        status.update("judging on held-out runs")
-        longest = arguments.steps
+        longest = min(arguments.steps, most_steps(learned, held_out))
+        show(f"judging on held-out runs, at most {longest} steps ahead")
         steps = {step for step in _JUDGED_STEPS if step <= longest} | {longest}
         judgement = logs.judge(learned, held_out, train, sorted(steps))
     return learned, judgement
@@ -136,6 +139,8 @@ def _fingerprint(arguments: argparse.Namespace, train: Log) -> str:
     """Returns a text that differs where code, data or settings differ."""
     settings = (
         train.mapping,
+        train.time_step,
+        [run.begins for run in train],
         arguments.points,
         arguments.steps,
         arguments.seed,
@@ -146,15 +151,15 @@ def _fingerprint(arguments: argparse.Namespace, train: Log) -> str:
         content["_target_"] = train.mapping.nominal.code.replace(":", ".")
     arrays = []
     for run in train:
-        arrays += [run.states, run.inputs, run.context]
+        arrays += [run.time, run.states, run.inputs, run.context]
     return fingerprint(content, arrays)
 
 
 def _split(log: Log, held_out: Sequence[str]) -> tuple[Log, Log]:
     """Returns the runs to learn from and those to judge on.
 
-    Where nobody chose, a fifth of the runs is held out, of all lengths; of one run the
-    last fifth.
+    Where nobody chose, a fifth of the runs is held out, of all lengths: the middle ones
+    of as many groups. Of one run it is the last fifth.
     """
     if held_out:
         return log.split([*held_out])
@@ -162,8 +167,8 @@ def _split(log: Log, held_out: Sequence[str]) -> tuple[Log, Log]:
     if len(names) == 1:
         return log.split_by_time(0.8)
     count = max(len(names) // 5, 1)
-    every = max(len(names) // count, 1)
-    return log.split(names[::every][:count])
+    groups = np.array_split(names, count)
+    return log.split([str(group[(len(group) - 1) // 2]) for group in groups])
 
 
 class _FileMemory(dict[str, Any]):
@@ -348,9 +353,7 @@ def _card(
     """
     columns = [*train.space.names, *train.input_names]
     left_out = [
-        f"{finding.run}: {finding.kind}: {finding.text}"
-        for finding in train.findings
-        if finding.run in learned.runs
+        f"{finding.run}: {finding.kind}: {finding.text}" for finding in train.findings
     ]
     reasons = _reasons_against(learned, judgement)
     title = "Model card"

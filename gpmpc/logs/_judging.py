@@ -7,6 +7,7 @@ mean variance that is claimed over the root mean squared error. Coverage alone i
 a width of one is honest.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -16,7 +17,7 @@ import pandas as pd
 from scipy.special import ndtri
 
 from gpmpc._dynamics import Array
-from gpmpc.exceptions import SettingError, check_kind, check_number
+from gpmpc.exceptions import DataError, SettingError, check_kind, check_number
 from gpmpc.logs._baselines import baseline_errors
 from gpmpc.logs._comparison import Comparison, compare
 from gpmpc.logs._fitting import PAST
@@ -120,10 +121,11 @@ def judge(
         learned: From ``learn``.
         held_out: Runs that it never saw.
         train: The runs that it was learned from, to which the baselines are fitted.
-        steps: k.
+        steps: k, each larger than the one before.
 
     Raises:
-        SettingError: An argument is of another kind, or there is no step.
+        SettingError: An argument is of another kind, or there is no step, or steps do
+            not increase.
         DataError: No piece of the held-out log is long enough.
 
     See Also:
@@ -160,12 +162,41 @@ def judge(
     )
 
 
+def check_held_out(held_out: Log, steps: int) -> None:
+    """Raises ``DataError`` of a log on which no model can be judged.
+
+    Args:
+        held_out: Runs that are to be held out.
+        steps: The most of the steps ahead.
+    """
+    needed = PAST + steps + 1
+    longest = held_out.longest_piece
+    if longest < needed:
+        names = ", ".join(run.name for run in held_out)
+        raise DataError(
+            f"{names}: judging {steps} steps ahead needs {needed} rows without a gap; "
+            f"the longest piece that is held out has {longest}: hold out longer runs, "
+            "or ask for fewer steps"
+        )
+
+
+def most_steps(learned: IdentifiedModel, held_out: Log) -> int:
+    """Returns how many steps ahead a model can be judged on a log, one at least.
+
+    A model that looks back on many rows leaves fewer of them ahead.
+    """
+    past = max(learned.model.past, PAST)
+    return max(held_out.longest_piece - past - 1, 1)
+
+
 def _check_steps(steps: Sequence[int]) -> None:
-    """Raises ``SettingError`` unless steps are numbers of one or more."""
+    """Raises ``SettingError`` unless steps are numbers of one or more, and increase."""
     if np.ndim(steps) != 1 or not np.size(steps):
         raise SettingError("steps", f"must be a list of numbers; got {steps!r}")
     for step in steps:
         check_number("steps", step, least=1, whole=True)
+    if any(later <= step for step, later in itertools.pairwise(steps)):
+        raise SettingError("steps", f"must increase; got {list(steps)}")
 
 
 def _comparisons(

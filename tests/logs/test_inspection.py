@@ -3,15 +3,18 @@
 import json
 import runpy
 import sys
+from argparse import Namespace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas
 import pytest
 
-from gpmpc.cli._learn import _FileMemory
+from gpmpc.cli._learn import _FileMemory, _fingerprint, _split
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.logs import LogMapping, inspect_log
+from gpmpc.logs import Log, LogMapping, inspect_log
+from gpmpc.logs._log import LogRun
 from gpmpc.plotting import inspection_figure, png
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -217,6 +220,55 @@ def test_learn_writes_its_three_files_and_names_mistakes(tmp_path):
         2,
         "gpmpc: held_out: no such run '7'; there are 0, 1\n",
     )
+
+
+def test_runs_that_are_too_short_to_judge_on_are_refused_first(tmp_path):
+    rows = "\n".join(f"{0.1 * k},{k % 7},{k % 5}" for k in range(60))
+    (tmp_path / "short.csv").write_text(f"t,x,u\n{rows}\n")
+    (tmp_path / "map.yaml").write_text("time: t\nstates: {x: [x]}\ninputs: {u: [u]}")
+    result = forked("learn", "map.yaml", "short.csv", cwd=tmp_path)
+    expected = (
+        "gpmpc: short, last part: judging 50 steps ahead needs 71 rows without a gap; "
+        "the longest piece that is held out has 12: hold out longer runs, or ask for "
+        "fewer steps\n"
+    )
+    assert (result.returncode, result.stderr) == (2, expected)
+    assert not (tmp_path / "learned").exists()
+
+
+def run_of(rows, name="run"):
+    values = np.arange(rows * 2.0).reshape(rows, 2)
+    time = 0.1 * np.arange(rows)
+    return LogRun(name, time, values[:, :1], values[:, 1:], np.empty((rows, 0)))
+
+
+@pytest.mark.parametrize(
+    ("lengths", "held_out"),
+    [
+        ([40, 300, 200, 250, 100], [200]),
+        ([300, 40], [40]),
+        ([*range(30, 41)], [32, 38]),
+    ],
+)
+def test_runs_of_middle_length_are_held_out_by_default(lengths, held_out):
+    runs = tuple(run_of(rows + 30, f"{rows}") for rows in lengths)
+    mapping = LogMapping.from_dict({"states": {"x": ["x"]}, "inputs": {"u": ["u"]}})
+    _, judged = _split(Log(mapping, 0.1, runs), [])
+    assert sorted(len(run) - 30 for run in judged) == held_out
+
+
+def test_outcomes_are_of_the_times_and_pieces_of_the_rows():
+    mapping = LogMapping.from_dict({"states": {"x": ["x"]}, "inputs": {"u": ["u"]}})
+    arguments = Namespace(points=10, steps=5, seed=0, for_control=False)
+    run = run_of(30)
+    logs = [
+        Log(mapping, 0.1, (run,)),
+        Log(mapping, 0.2, (replace(run, time=2 * run.time),)),
+        Log(mapping, 0.1, (replace(run, begins=(0, 10)),)),
+    ]
+    names = [_fingerprint(arguments, log) for log in (*logs, logs[0])]
+    assert names[0] == names[3]
+    assert len({*names}) == 3
 
 
 def test_stage_results_are_reused_or_a_line_says_why_not(tmp_path):

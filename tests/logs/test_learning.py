@@ -221,6 +221,9 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
     train, held_out = log.split(["run 2"])
     learned = learn(train, points=60, steps=20)
     assert not judge(learned, held_out, train, steps=(1, 10)).losses
+    for steps in ((10, 1), (1, 1)):
+        with pytest.raises(SettingError, match="steps: must increase"):
+            judge(learned, held_out, train, steps=steps)
     wrong = replace(
         learned, model=replace(learned.model, theta=-learned.model.theta, gps=())
     )
@@ -357,6 +360,8 @@ def test_misuse_is_named(flights):
         fit_nominal(model, np.zeros(3), log)
     with pytest.raises(DataError, match="the longest has 1500"):
         fit_nominal(model, None, log, steps=3000)
+    with pytest.raises(SettingError, match="most: must be"):
+        log.windows(10, most=0)
     with pytest.raises(SettingError, match="past"):
         replace(model, theta=model.nominal.start).rollout(log.windows(10))
 
