@@ -181,16 +181,12 @@ class SavedModel:
         if not isinstance(self.model, LogDynamics):
             return self.signals
         namings = self.model.namings
-        names = {
-            "state_names": (system.state_names, namings.states),
-            "input_names": (system.input_names, namings.inputs),
-        }
-        systems_own = {
-            key: own
-            for key, (own, ways) in names.items()
-            if order_by_name(own, ways) == list(range(len(own)))
-        }
-        return replace(self.signals, **systems_own)
+        signals = self.signals
+        if _are_called(system.state_names, namings.states):
+            signals = replace(signals, state_names=system.state_names)
+        if _are_called(system.input_names, namings.inputs):
+            signals = replace(signals, input_names=system.input_names)
+        return signals
 
     def _check_size(
         self, key: str, dim: int, names: Sequence[str], system: System
@@ -201,6 +197,11 @@ class SavedModel:
             content = f"the {key} {', '.join(names) or dim}"
             rule = f"{system.name} has {', '.join(expected)}"
             raise SettingError("model", f"{self.path} has {content}; {rule}")
+
+
+def _are_called(own: Sequence[str], namings: Sequence[Sequence[str]]) -> bool:
+    """Returns whether names are one of the ways to call entries, in their order."""
+    return order_by_name(own, namings) == list(range(len(own)))
 
 
 def load_flyable(path: str | Path, trusted: Sequence[str] | None = None) -> SavedModel:
