@@ -8,6 +8,7 @@ the training rows, so that no held-out window overlaps what a model was fitted t
 """
 
 import itertools
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -91,13 +92,8 @@ def _deals_of_runs(log: Log, past: int, steps: int) -> list[Folds]:
     """Returns ways to deal whole runs to two folds, the best one alone."""
     runs = sorted(log.runs, key=len)
     count = len(runs)
-    alternating = tuple(range(0, count, 2))
-    deals = [alternating]
-    deals += itertools.islice(
-        itertools.combinations(range(1, count), count // 2), _DEALS
-    )
     splits = []
-    for deal in deals:
+    for deal in _deals(count):
         first = tuple(runs[i] for i in deal)
         second = tuple(runs[i] for i in range(count) if i not in deal)
         folds = _folds(
@@ -106,6 +102,22 @@ def _deals_of_runs(log: Log, past: int, steps: int) -> list[Folds]:
         if _is_usable(folds, past, steps):
             splits.append(folds)
     return sorted(splits, key=lambda folds: -folds.coverage)[:1]
+
+
+def _deals(count: int) -> list[tuple[int, ...]]:
+    """Returns the first fold's runs of some deals, alternating ones first.
+
+    The others are all deals, or of many some by chance: the first ones in any order
+    would be alike. The first run is in the second fold, as every deal has a mirror
+    image.
+    """
+    alternating = tuple(range(0, count, 2))
+    size = count // 2
+    if math.comb(count - 1, size) <= _DEALS:
+        return [alternating, *itertools.combinations(range(1, count), size)]
+    rng = np.random.default_rng(0)
+    drawn = [1 + rng.permutation(count - 1)[:size] for _ in range(_DEALS)]
+    return [alternating, *(tuple(sorted(deal.tolist())) for deal in drawn)]
 
 
 def _blocks(log: Log, count: int, past: int, steps: int) -> Folds | None:

@@ -98,6 +98,14 @@ def test_runs_are_dealt_so_that_ranges_are_covered():
     for fold in folds.pair:
         wide = [size for run in fold.train for size in [np.abs(run.states).max()]]
         assert max(wide) > 2
+    # Of many runs, deals are compared that are not alike.
+    rng = np.random.default_rng(2)
+    lengths = np.sort(rng.integers(80, 200, 20))
+    centres = rng.permutation(np.repeat([0, 0, 0, 0, 0, 0, 3, -3, 6, -6], 2))
+    runs = zip(centres, lengths, strict=True)
+    states = [centre + rng.uniform(-1, 1, (rows, 2)) for centre, rows in runs]
+    log = log_of(states, [rng.uniform(-1, 1, (rows, 1)) for rows in lengths])
+    assert split_folds(log, past=23, steps=10).coverage > 0.95
 
 
 def test_coupled_outputs_are_learned_together():
