@@ -70,6 +70,8 @@ class Flying:
     tried_again: list[str] = field(default_factory=list)
     #: runs that were ended from outside too often, and do not fly; attempts by path
     given_up: dict[str, int] = field(default_factory=dict)
+    #: why runs failed whose folders cannot be written, such as on a full disk, by path
+    reasons_not_kept: dict[str, str] = field(default_factory=dict)
     _open: dict[str, Job] = field(default_factory=dict)  # by path, not settled yet
     _failed_before: dict[str, int | None] = field(default_factory=dict)
     _begun_before: dict[str, int | None] = field(default_factory=dict)
@@ -187,12 +189,24 @@ class Flying:
             job.folder.lose(end.reason, cause.value, about)
         except Busy:  # another sweep works on it: its outcome counts
             return
+        except OSError as error:
+            problem = error.strerror or error
+            reason = f"{end.reason} (its folder does not say so: {problem})"
+            self._settle_without_file(job, reason)
+            return
         path = str(job.folder.path)
         if cause in _REPEATED and job.folder.lost_attempts <= self.retries:
             self.repeated.add(path)
             self._failed_before[path] = job.folder.failed_at
             return
         self._settle(job)
+
+    def _settle_without_file(self, job: Job, reason: str) -> None:
+        """Takes a job off the list that failed, and whose folder cannot say so."""
+        path = str(job.folder.path)
+        self.reasons_not_kept[path] = reason
+        del self._open[path]
+        self.on_settled(job, RunState.FAILED)
 
     @cached_property
     def _provenance(self) -> dict[str, Any]:

@@ -161,7 +161,8 @@ class Sweep:
 
         def settle(job: Job, state: RunState) -> None:
             self._chunking.measure(job)
-            outcomes.append(self._outcome(job, state))
+            reason = flying.reasons_not_kept.get(str(job.folder.path))
+            outcomes.append(self._outcome(job, state, reason))
 
         flying = Flying(
             launcher=self._launcher,
@@ -183,9 +184,19 @@ class Sweep:
                 self._remarks.add(kind)
                 print_error(remark)
 
-    def _outcome(self, job: Job, state: RunState) -> JobOutcome:
-        """Reads how a run ended, for the index, too; its warning is noted."""
+    def _outcome(
+        self, job: Job, state: RunState, reason: str | None = None
+    ) -> JobOutcome:
+        """Reads how a run ended, for the index, too; its warning is noted.
+
+        Args:
+            job: The run.
+            state: How it ended.
+            reason: Why it failed, where its folder cannot say so.
+        """
         folder = self.tree / job.folder.path.name
+        if reason is not None:
+            return JobOutcome(str(folder), reason)
         self._print_remarks(job.folder.remarks())
         if state is RunState.FAILED:
             return JobOutcome(str(folder), job.folder.error())
@@ -295,8 +306,11 @@ def sweep(arguments: Namespace) -> Result:
         finished_before = sum(job.folder.finished for job in jobs)
         runs.check(jobs)
         _write_plan(runs.tree, jobs)
-        with runs.progress(jobs, len(jobs)):
-            outcomes = runs.fly(jobs)
+        try:
+            with runs.progress(jobs, len(jobs)):
+                outcomes = runs.fly(jobs)
+        except OSError as error:
+            return _ended_early(runs.tree, error)
     end = _end_of(jobs, outcomes, finished_before)
     text = f"{end.line()}{_count_warnings(runs.warnings)}; in {runs.tree}"
     console.out(text, highlight=False)
@@ -315,6 +329,17 @@ def sweep(arguments: Namespace) -> Result:
         ],
     }
     return Result(data, 1 if end.failed or end.gone else 0)
+
+
+def _ended_early(tree: Path, error: OSError) -> Result:
+    """Says that the command cannot go on, such as where a disk is full."""
+    place = error.filename or tree
+    reason = f"{place}: {error.strerror or error}"
+    print_error(
+        f"{reason}; the sweep ended before its runs did, and the same command goes on "
+        "where it stopped"
+    )
+    return Result({"folder": str(tree), "error": reason}, 1)
 
 
 def _distinct(jobs: Iterable[Job]) -> list[Job]:

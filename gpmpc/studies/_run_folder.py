@@ -16,6 +16,7 @@ A finished run is one of the code that flew it. It is not thrown away where the 
 changed since, but whoever shows its numbers says so: ``of_other_code`` tells.
 """
 
+import errno
 import hashlib
 import json
 import os
@@ -45,6 +46,8 @@ _LOCK = ".lock"  # stays, and says who worked on the folder last
 _EARLIER_ERROR = ".error.json"
 _PROBES = 5  # of a lock that may only be looked at by another process
 _PROBE_INTERVAL = 0.01  # between two of them [s]
+# Of opening a file of another user, or on a file system that may only be read.
+_NOT_WRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS)
 _NOT_IN_NAME = re.compile(r"[^a-z0-9_=.,+\-\[\]@]")
 LONGEST_NAME = 150  # characters of a folder's name; file systems take 255 bytes
 
@@ -98,6 +101,10 @@ class RunFolder:
             file = os.open(self.path / _LOCK, os.O_RDWR)
         except FileNotFoundError:
             return False
+        except OSError as error:
+            if error.errno not in _NOT_WRITABLE:
+                raise
+            return _is_locked_by_others(self.path / _LOCK)
         try:
             return not lock_descriptor(file, blocking=False)
         finally:
@@ -278,6 +285,21 @@ class RunFolder:
                 "choose another folder, or remove that one to fly it again",
             )
         return content
+
+
+def _is_locked_by_others(path: Path) -> bool:
+    """Whether a process holds a lock on a file that may only be read here.
+
+    A shared lock tells; network file systems give readers no other.
+    """
+    import fcntl  # of POSIX
+
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 def _lock_soon(file: int) -> bool:
