@@ -64,6 +64,8 @@ _LOGGED = (
     (re.compile(r"CANCELLED AT \S+ DUE TO PREEMPTION"), Cause.NODE),
     (re.compile(r"\*\*\* (JOB|STEP) \S+ ON \S+ CANCELLED AT"), Cause.CANCELLED),
 )
+# What it writes before it starts a job anew, behind which another attempt begins.
+_REQUEUED = re.compile(r"CANCELLED AT \S+ DUE TO JOB REQUEUE[^\n]*\n?")
 # A job that waits for a reason of these was given up by Slurm.
 _GIVEN_UP = (
     "launch failed requeued held",
@@ -472,11 +474,12 @@ def _run(
 
 
 def _tail(log: Path) -> str | None:
-    """Returns the end of a log; None where there is none."""
+    """Returns the end of the last attempt's log; None where there is none."""
     try:
-        return log.read_text(encoding="utf-8", errors="replace")[-_TAIL:]
+        text = log.read_text(encoding="utf-8", errors="replace")[-_TAIL:]
     except OSError:
         return None
+    return _REQUEUED.split(text)[-1]
 
 
 def _one_line(text: str) -> str:

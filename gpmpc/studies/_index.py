@@ -250,13 +250,15 @@ def _texts_by_name(content: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _finite_measures(content: Mapping[str, Any]) -> dict[str, float | None]:
-    """Returns measures by name.
+    """Returns measures by name; a failed run has none.
 
     Raises:
-        ValueError: One is no finite number.
+        ValueError: One is no finite number, or they are those of another version.
     """
+    if content and content.keys() != MEASURES.keys():
+        raise ValueError(f"has other measures: {', '.join(content)}")
     for name, value in content.items():
         is_number = type(value) in (int, float) and math.isfinite(value)
-        if name not in MEASURES or not (is_number or value is None):
+        if not (is_number or value is None):
             raise ValueError(f"{name}: must be a finite number; got {value!r:.80}")
     return {intern(name): value for name, value in content.items()}

@@ -1,5 +1,6 @@
 """A sweep's runs count by their folders, whatever becomes of the processes."""
 
+import errno
 import json
 import os
 import signal
@@ -71,6 +72,19 @@ def test_a_chunk_that_is_said_to_be_done_and_is_not_there_has_failed(
     assert error["host"] == "blind (10.0.0.7)"
     assert error["error"].startswith("blind (10.0.0.7) says that it flew this run, and")
     assert error["attempts"] == 1
+
+
+def test_a_run_that_nobody_can_write_down_has_failed(tmp_path, monkeypatch):
+    def refuse(*arguments):
+        raise OSError(errno.ENOSPC, "disk full")
+
+    jobs = jobs_of(tmp_path, "flies", "flies")
+    monkeypatch.setattr(RunFolder, "lose", refuse)
+    launcher = Told(tmp_path, {"cause": Cause.ERROR, "reason": "cannot write"})
+    flying, states = flown(launcher, jobs)
+    assert states == {"0-flies": "failed", "1-flies": "finished"}
+    (reason,) = flying.reasons_not_kept.values()
+    assert reason == "cannot write (its folder does not say so: disk full)"
 
 
 def test_a_shared_file_system_may_show_a_run_late(tmp_path, monkeypatch):

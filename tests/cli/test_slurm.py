@@ -131,6 +131,13 @@ def outcomes(tree, jobs, size=1, launcher=None, flown_before=()):
         ("0|PREEMPTED|None|n2", None, "", "node", "preempted"),
         ("", None, None, "cancelled", "was cancelled"),
         ("", None, f"{KILLED} DUE TO TIME LIMIT ***", "time", "wall time of 60 min"),
+        (
+            "",
+            None,
+            f"{KILLED} DUE TO JOB REQUEUE ***\nSegmentation fault\n",
+            "crash",
+            "its log ends: 'Segmentation",
+        ),
         ("", None, f"{KILLED} DUE TO NODE FAILURE ***", "node", "with its node"),
         ("", "0|NODE_FAIL||n1", "", "node", "job 7_0 on n1 was ended with its node"),
         ("", "0|CANCELLED by 1000||None assigned", "", "cancelled", "7_0 was cancel"),

@@ -1,5 +1,6 @@
 """Folders of runs have own names, and two runs' different settings are put in words."""
 
+import errno
 import json
 import os
 import socket
@@ -188,6 +189,22 @@ def test_a_folder_alone_tells_how_far_its_run_is(tmp_path):
     folder.lose("too late", "time", {})
     assert folder.state is RunState.FINISHED
     assert not (folder.path / ERROR).exists()
+
+
+def test_who_may_only_read_a_run_sees_whether_it_flies(tmp_path, monkeypatch):
+    folder = RunFolder(tmp_path / "run")
+    opened = os.open
+
+    def read_only(path, flags, *rest):
+        if flags & os.O_RDWR:
+            raise OSError(errno.EROFS, "read-only")
+        return opened(path, flags, *rest)
+
+    with folder.locked():
+        folder.begin("steps: 1\n")
+        monkeypatch.setattr(os, "open", read_only)
+        assert folder.state is RunState.RUNNING
+    assert folder.state is RunState.LOST
 
 
 def test_attempts_that_were_ended_from_outside_are_counted(tmp_path):
