@@ -80,35 +80,61 @@ def judge_for_control(
     slopes = _mean_slopes(model, states, inputs, context)
     deviation = np.maximum(measured.std(axis=0), 1e-12)
     names = log.input_names
-    significance = np.abs(gains) / np.maximum(errors, 1e-300)
-    effects = []
-    for j, name in enumerate(names):
-        i = int(significance[:, j].argmax())
-        effects.append(
-            Effect(
-                input=name,
-                output=model.kinematics.output_names[i],
-                gain=float(gains[i, j]),
-                low=float(gains[i, j] - 1.96 * errors[i, j]),
-                high=float(gains[i, j] + 1.96 * errors[i, j]),
-                model=float(slopes[i, j]),
-            )
-        )
+    significance = _significance(gains, errors)
+    effects = _effects(model, names, gains, errors, slopes)
     unknown = _unknown_effects(log, inputs, significance)
     faults = [*unknown.values()]
     moves = np.abs(slopes) * np.ptp(inputs, axis=0) / deviation[:, None]
     if moves.max() < _LEAST_EFFECT:
         faults.append("no output of the model depends on any input")
-    warnings = [
+    known = [effect for effect in effects if effect.input not in unknown]
+    warnings = _disagreements(known) + _unstable_loops(model, log, rivals)
+    advice = _excitation(log, names, inputs) if faults else ()
+    return ControlFitness(tuple(effects), tuple(faults), tuple(warnings), advice)
+
+
+def _effects(
+    model: LogModel, names: Sequence[str], gains: Array, errors: Array, slopes: Array
+) -> list[Effect]:
+    """Returns the effect of each input on the output that it moves most.
+
+    Args:
+        model: Has the names of the outputs.
+        names: Of the inputs (m,).
+        gains: Of the outputs by the inputs, from the rows (o, m).
+        errors: Their standard errors (o, m).
+        slopes: Mean derivatives of the model (o, m).
+    """
+    significance = _significance(gains, errors)
+    effects = []
+    for j, name in enumerate(names):
+        i = int(significance[:, j].argmax())
+        half_width = 1.96 * errors[i, j]
+        effect = Effect(
+            input=name,
+            output=model.kinematics.output_names[i],
+            gain=float(gains[i, j]),
+            low=float(gains[i, j] - half_width),
+            high=float(gains[i, j] + half_width),
+            model=float(slopes[i, j]),
+        )
+        effects.append(effect)
+    return effects
+
+
+def _significance(gains: Array, errors: Array) -> Array:
+    """Computes by how many standard errors gains (o, m) differ from none."""
+    return np.abs(gains) / np.maximum(errors, 1e-300)
+
+
+def _disagreements(effects: Sequence[Effect]) -> list[str]:
+    """Says of which effects the model and the rows do not agree."""
+    return [
         f"the model says {effect.model:.3g} for the effect of {effect.input} on "
         f"{effect.output}, the rows {effect.low:.3g} to {effect.high:.3g}"
         for effect in effects
-        if effect.input not in unknown
-        and not _agree(effect.model, effect.low, effect.high)
+        if not _agree(effect.model, effect.low, effect.high)
     ]
-    warnings += _unstable_loops(model, log, rivals)
-    advice = _excitation(log, names, inputs) if faults else ()
-    return ControlFitness(tuple(effects), tuple(faults), tuple(warnings), advice)
 
 
 def _agree(model: float, low: float, high: float) -> bool:

@@ -33,14 +33,14 @@ from gpmpc.logs._log import LogRun
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._mapping_advice import advise_turned_body
 from gpmpc.logs._motion_windows import LONGEST_LAG, cut_motion_windows
-from gpmpc.logs._relations import HALF, TILT_FITS, MotionRelations, fits_tilt
+from gpmpc.logs._relations import BETTER_RATIO, TILT_FITS, MotionRelations, fits_tilt
 from gpmpc.models._kinematics import GRAVITY
 
 _RIGID_BODY = [("vector", 3), ("quaternion", 3), ("vector", 3), ("vector", 3)]
 FITS = 0.75  # misfit below which an axis may fit
-BAD = 0.8  # misfit from which an axis fits badly
+BAD_MISFIT = 0.8  # misfit from which an axis fits badly
 UNRELATED = 0.5  # correlation below which signals have nothing to do with each other
-NEAR = 0.25  # of the score within which interpretations cannot be told apart
+SCORE_MARGIN = 0.25  # of the score within which interpretations cannot be told apart
 GAIN = 0.3  # least gain of a score for which an interpretation is believed
 LEAST_REFUSED_LAG = 0.15  # [s]; a shorter one is a finding
 
@@ -137,7 +137,7 @@ def _equal_alternative(
     """Describes another interpretation that fits as well as the best; mostly empty."""
     best = mistakes_of(candidates[0], search)
     for candidate in candidates[1:]:
-        if candidate.score > candidates[0].score + NEAR:
+        if candidate.score > candidates[0].score + SCORE_MARGIN:
             break
         mistakes = mistakes_of(candidate, search)
         if mistakes != best and len(mistakes) <= len(best):
@@ -159,7 +159,7 @@ def _is_better(best: Interpretation, claimed: Interpretation) -> bool:
     if claimed.score - best.score < GAIN:
         return False
     for fit, claim in ((best.velocity, claimed.velocity), (best.rate, claimed.rate)):
-        is_better = (fit.misfits < FITS) & (fit.misfits < HALF * claim.misfits)
+        is_better = (fit.misfits < FITS) & (fit.misfits < BETTER_RATIO * claim.misfits)
         if (is_better & (claim.misfits > DOUBTFUL)).any():
             return True
     if claimed.tilt is None or best.tilt is None or not fits_tilt(best.tilt):
@@ -209,7 +209,7 @@ def _unexplained(relations: MotionRelations, claimed: Interpretation) -> str:
     fits = (claimed.velocity, claimed.rate)
     for relation, fit in zip(relations.claimed_relations, fits, strict=True):
         correlations = relation.correlations
-        unrelated = (fit.misfits > BAD) & (np.abs(correlations) < UNRELATED)
+        unrelated = (fit.misfits > BAD_MISFIT) & (np.abs(correlations) < UNRELATED)
         for axis in np.flatnonzero(unrelated & relation.moves & relation.is_smooth):
             return (
                 f"{relation.measured.name} in {'xyz'[axis]} has nothing to do with "

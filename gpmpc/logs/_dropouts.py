@@ -16,13 +16,15 @@ SENTINELS = np.array(
     + [2.0**bits - 1 for bits in (16, 32, 64)]
 )
 HUGE = 1e20  # no state, input or context has such values in any unit
-FAR = 10.0  # ranges of the other values, from which on a sentinel is no measurement
+SENTINEL_RANGES = (
+    10.0  # ranges of the other values, from which on a sentinel is no measurement
+)
 JUMP_CHANGES = 3.0  # usual changes, from which on a change is a jump
 FROZEN = 10  # rows
 FROZEN_AT_END = 50  # rows, of a stretch that nothing ends
 FEWEST_CHANGES = 10  # that tell how a sensor changes
-MOST = 0.5  # of rows: what holds for more of them holds for most
-SMALL = 0.1  # quantile of the changes that is a small one
+MAJORITY = 0.5  # of rows
+SMALL_QUANTILE = 0.1  # quantile of the changes that is a small one
 VARIED = 0.3  # of the usual change: changes below it are of a sensor without steps
 
 
@@ -47,7 +49,7 @@ def sentinels(values: Array) -> np.ndarray:
         return candidates & ((values < 0) | (np.abs(values) >= HUGE))
     lowest = measured.min()
     highest = measured.max()
-    margin = FAR * max(highest - lowest, abs(lowest), abs(highest))
+    margin = SENTINEL_RANGES * max(highest - lowest, abs(lowest), abs(highest))
     return candidates & ((values < lowest - margin) | (values > highest + margin))
 
 
@@ -97,7 +99,7 @@ def frozen_rows(column: Array, moving: np.ndarray) -> np.ndarray:
         at_end = end == len(column)
         long_enough = end - begin >= (FROZEN_AT_END if at_end else FROZEN)
         ends_as_silence = at_end or changes[end - 1] > JUMP_CHANGES * usual
-        others_move = moving[begin:end].mean() > MOST
+        others_move = moving[begin:end].mean() > MAJORITY
         if long_enough and ends_as_silence and others_move:
             frozen[begin:end] = True
     return frozen
@@ -111,9 +113,9 @@ def changes_rarely(column: Array, moving: np.ndarray) -> bool:
     """
     changes = np.abs(np.diff(column))[moving[1:]]
     nonzero = changes[changes > 0]
-    if len(nonzero) < FEWEST_CHANGES or len(nonzero) > MOST * len(changes):
+    if len(nonzero) < FEWEST_CHANGES or len(nonzero) > MAJORITY * len(changes):
         return False
-    small_change = float(np.quantile(nonzero, SMALL))
+    small_change = float(np.quantile(nonzero, SMALL_QUANTILE))
     return small_change < VARIED * float(np.median(nonzero))
 
 

@@ -83,8 +83,22 @@ def fit_nominal(
     theta0 = np.concatenate([theta0, np.full(lags, _FIRST_TIME_CONSTANT)])
     if not len(theta0):
         return NominalFit(replace(model, theta=theta0), standard_errors=theta0)
-    bounds = _bounds(model, lags)
-    residuals = _RolloutResiduals(model, windows, steps, bounds)
+    residuals = _RolloutResiduals(model, windows, steps, _bounds(model, lags))
+    theta = _minimize(residuals, theta0)
+    time_constants = np.maximum(theta[count:], 0.0)
+    standard_errors = _standard_errors(
+        J=residuals.jacobian(theta), residuals=residuals.of_windows(theta[None])[0]
+    )
+    fitted = replace(model, theta=theta[:count], time_constants=time_constants)
+    return NominalFit(fitted, standard_errors[:count])
+
+
+def _minimize(residuals: "_RolloutResiduals", theta0: Array) -> Array:
+    """Finds the parameters (P,) within their bounds whose rollouts err least.
+
+    Raises:
+        DataError: The rollouts at theta0 are not finite.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         if not (np.abs(residuals(theta0)) < _DIVERGED).all():
             rule = "begin nearer, or with fewer steps"
@@ -93,20 +107,14 @@ def fit_nominal(
             residuals,
             theta0,
             residuals.jacobian,
-            bounds=bounds,
+            bounds=residuals.bounds,
             loss="soft_l1",
             x_scale="jac",
             xtol=1e-4,
             ftol=1e-4,
             max_nfev=_EVALUATIONS,
         )
-    theta = solution.x
-    time_constants = np.maximum(theta[count:], 0.0)
-    standard_errors = _standard_errors(
-        J=residuals.jacobian(theta), residuals=residuals.of_windows(theta[None])[0]
-    )
-    fitted = replace(model, theta=theta[:count], time_constants=time_constants)
-    return NominalFit(fitted, standard_errors[:count])
+    return solution.x
 
 
 def _bounds(model: LogModel, lags: int) -> tuple[Array, Array]:
@@ -119,7 +127,14 @@ def _bounds(model: LogModel, lags: int) -> tuple[Array, Array]:
 
 
 class _RolloutResiduals:
-    """Errors of a model's rollouts as a function of its parameters, without units."""
+    """Errors of a model's rollouts as a function of its parameters, without units.
+
+    Args:
+        model: Its own parameters do not matter.
+        windows: W of them.
+        steps: Of the rollouts.
+        bounds: Smallest and largest parameters (P,), (P,).
+    """
 
     def __init__(
         self,
@@ -128,7 +143,7 @@ class _RolloutResiduals:
         steps: int,
         bounds: tuple[Array, Array],
     ):
-        self._low, self._high = bounds
+        self.bounds = bounds
         self._model = model
         self._windows = windows
         self._steps = steps
@@ -161,8 +176,9 @@ class _RolloutResiduals:
         may refuse what lies beyond it.
         """
         h = 1e-5 * np.maximum(np.abs(theta), 1.0)
-        above = self._high - theta
-        below = theta - self._low
+        low, high = self.bounds
+        above = high - theta
+        below = theta - low
         h = np.minimum(h, np.maximum(above, below))
         h = np.where(h <= above, h, -h)
         displaced = theta + np.diag(h)

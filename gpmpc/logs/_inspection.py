@@ -32,6 +32,7 @@ from gpmpc.logs._columns import (
 )
 from gpmpc.logs._delays import Delay, delay_table, find_delays
 from gpmpc.logs._file import STAMP, Tables
+from gpmpc.logs._findings import Finding
 from gpmpc.logs._formats import read_file
 from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
@@ -179,6 +180,28 @@ def inspect_log(
         )
         for source in _sources(path, file.tables, mapping)
     ]
+    return _inspection_of(
+        name=Path(path).name,
+        streams=streams,
+        findings=file.findings,
+        reading=_read_with(mapping, path),
+    )
+
+
+def _inspection_of(
+    name: str,
+    streams: Sequence[_Stream],
+    findings: Sequence[Finding],
+    reading: _Reading,
+) -> Inspection:
+    """Puts together what the streams of a file and the reading of it say.
+
+    Args:
+        name: Of the file.
+        streams: Inspected.
+        findings: Of the file's reader.
+        reading: With the mapping.
+    """
     channels: dict[str, ChannelFigures] = {}
     lines: dict[str, tuple[Array, Array]] = {}
     for stream in streams:
@@ -186,10 +209,9 @@ def inspect_log(
         lines |= stream.lines
     delays = [delay for stream in streams for delay in stream.delays]
     delays = sorted(delays, key=lambda delay: -abs(delay.correlation))[:MOST_DELAYS]
-    reading = _read_with(mapping, path)
-    text_columns = [name for stream in streams for name in stream.text_columns]
+    text_columns = [column for stream in streams for column in stream.text_columns]
     warnings = [
-        *(f"{finding.kind}: {finding.text}" for finding in file.findings),
+        *(f"{finding.kind}: {finding.text}" for finding in findings),
         *(warning for stream in streams for warning in stream.warnings),
         *text_warning(text_columns),
         *channel_warnings(channels),
@@ -201,7 +223,7 @@ def inspect_log(
         warnings.append("no channel of numbers stands beside the time")
     rows = sum(stream.summary["rows"] for stream in streams)
     return Inspection(
-        title=f"{Path(path).name}: {rows} rows, {len(channels)} channels",
+        title=f"{name}: {rows} rows, {len(channels)} channels",
         streams=pd.DataFrame([stream.summary for stream in streams]),
         channels=channel_table(channels),
         delays=delay_table(delays),

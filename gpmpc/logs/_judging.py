@@ -29,7 +29,7 @@ from gpmpc.models._state_space import StateSpace
 from gpmpc.models._windows import Windows
 
 STEPS = (1, 10, 50)
-MOST = 1.02  # of a baseline's error, from which on a model loses to it
+LOSING_RATIO = 1.02  # of a baseline's error, from which on a model loses to it
 LEVEL = 0.95
 MODEL = "model"  # name of the judged model among the predictors
 _WINDOWS = 1000
@@ -79,7 +79,7 @@ class Judgement:
         for one in self.comparisons:
             if one.name not in baselines:
                 continue
-            for k, g in np.argwhere((one.ratio > MOST) & (one.low > 1.0)):
+            for k, g in np.argwhere((one.ratio > LOSING_RATIO) & (one.low > 1.0)):
                 losses.append(
                     f"{self.groups[g]} {self.steps[k]} steps ahead: "
                     f"{self.mean[MODEL][k, g]:.3g} {self.units[g]}, "

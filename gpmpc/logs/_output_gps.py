@@ -30,7 +30,8 @@ def train_output_gp(
         model: With fitted parameters.
         log: The data.
         outputs: Those that the GP adds to.
-        rows: Rows over which features and targets are averaged.
+        rows: Consecutive rows over which a target is averaged; its features are those
+            of the row in the middle.
         points: Rows that the GP is trained on.
         seed: Of the choice of rows, and of the training.
     """
@@ -56,7 +57,7 @@ def train_output_gp(
 
 
 def _mean_residuals(model: LogModel, log: Log, rows: int) -> tuple[Array, Array]:
-    """Computes features (N, d) and residuals (N, o) of the means over some rows.
+    """Computes residuals averaged over some rows (N, o), with features (N, d).
 
     The features are those of the row in the middle.
     """

@@ -41,7 +41,9 @@ from gpmpc.models._quaternions import (
 )
 
 LEAST_CLOCK_LAG = 0.1  # [s] of the attitude behind the position that is said
-HALF = 0.5  # of the claim's misfit, which a better interpretation has to stay below
+BETTER_RATIO = (
+    0.5  # of the claim's misfit, which a better interpretation has to stay below
+)
 TILT_FITS = 0.6  # misfit below which the third relation holds; drag disturbs it
 TILT_MOVES = 0.3  # [m/s2] of the horizontal force from which it is looked at
 MOVES = 0.3  # [m/s], [rad/s] of an axis that is no hover's
@@ -273,7 +275,7 @@ class MotionRelations:
         tilt = tilt_misfits(rises[lag][rows], body_axis[rows])
         if tilt is None or not fits_tilt(tilt):
             return 0.0
-        is_better = (tilt < HALF * claimed_tilt).any()
+        is_better = (tilt < BETTER_RATIO * claimed_tilt).any()
         return float(lags[lag]) if is_better else 0.0
 
 

@@ -43,8 +43,8 @@ def save_learned(learned: IdentifiedModel, path: str | Path) -> None:
     """Writes what was learned from a log, in one piece or not at all.
 
     Raises:
-        SettingError: ``learned`` is of another kind, or its nominal model is a user's
-            own, which a file of numbers cannot hold.
+        SettingError: ``learned`` is of another kind, or its nominal model is: a file
+            holds those of gpmpc and, by the name of its code, a user's system.
         DataError: The folder does not exist.
 
     See Also:
@@ -62,7 +62,8 @@ def save_learned(learned: IdentifiedModel, path: str | Path) -> None:
         namings=learned.namings,
     )
     header, tensors = log_model_parts(path, named)
-    header["names"].append(learned.runs)
+    # The runs' names stand behind those of states, inputs and context.
+    header["names"] = [*header["names"], learned.runs]
     header["candidates"] = [
         [candidate.name, candidate.errors.tolist(), candidate.chosen]
         for candidate in learned.candidates
@@ -109,7 +110,7 @@ def _learned_of_parts(
     """Makes what was learned of a file's header and tensors."""
     named = log_model_of_parts(path, header, tensors, trusted)
     model = named.model
-    _, _, _, runs = header["names"]
+    *_, runs = header["names"]
     standard_errors = tensors["standard_errors"].numpy()
     if standard_errors.shape not in ((0,), model.theta.shape):  # the nameless have none
         raise DataError(f"standard_errors are no theta's; got {standard_errors.shape}")

@@ -10,13 +10,6 @@ import numpy as np
 from gpmpc._dynamics import Array
 
 
-class ActuatorState(NamedTuple):
-    """What is on its way from the inputs to their effects."""
-
-    pending: Array  # u[k-D] .. u[k-1], the oldest first (..., D, m)
-    lagged: Array  # a[k] (..., m); (..., 0) without first-order lags
-
-
 class FirstOrderLags(NamedTuple):
     """First-order lags that are discretised exactly for inputs that are held."""
 

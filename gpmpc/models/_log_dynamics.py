@@ -117,7 +117,7 @@ class LogDynamics:
         return self.model.at_rest(measured, input, _NO_CONTEXT)
 
     def follow(self, state: Array, input: Array, measured: Array) -> Array:
-        """Returns the state (n,) that a measurement says.
+        """Returns the next state (n,): what was measured, and the past a row later.
 
         Args:
             state: That of the step before (n,).

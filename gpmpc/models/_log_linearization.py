@@ -60,7 +60,7 @@ class LogLinearizer:
         slopes = self._next_slopes(x, local, outputs)
         V = None
         if covariance:
-            V = slopes.by_outputs @ outputs.covariance @ slopes.by_outputs.mT
+            V = slopes.by_learned @ outputs.covariance @ slopes.by_learned.mT
         return Linearized(
             np.concatenate([after, carried_after], axis=1),
             self._by_state(slopes, outputs.by_memory),
@@ -85,7 +85,7 @@ class LogLinearizer:
         )
         return _NextSlopes(
             by_point=np.concatenate([state_by_point, carried_by_point], axis=1),
-            by_outputs=np.concatenate([state_by_outputs, carried_by_outputs], axis=1),
+            by_learned=np.concatenate([state_by_outputs, carried_by_outputs], axis=1),
         )
 
     def _by_state(self, slopes: "_NextSlopes", by_memory: Array) -> Array:
@@ -99,7 +99,7 @@ class LogLinearizer:
         A[:, n:, n:] += maps.carried_by_carried
         s = by_memory.shape[-1]
         if s:
-            A[..., -s:] += slopes.by_outputs @ by_memory
+            A[..., -s:] += slopes.by_learned @ by_memory
         return A
 
     def _by_input(self, slopes: "_NextSlopes") -> Array:
@@ -212,7 +212,7 @@ class _NextSlopes(NamedTuple):
     """Derivatives of the N entries of the next state, at K points."""
 
     by_point: Array  # by x and the acting inputs (K, N, n + m)
-    by_outputs: Array  # by linear term and GPs (K, N, o)
+    by_learned: Array  # by what linear term and GPs add (K, N, o)
 
 
 class _LinearMaps(NamedTuple):
@@ -246,7 +246,8 @@ def _linear_maps(model: LogModel, m: int, time_step: float) -> _LinearMaps:
     pending = model.lag * m
     c = model.carried_dim(m)
     s = c - lagged - pending
-    # Of the queue (pending, input), by (c, input):
+    # What is in the queue (pending, input) are entries of (lagged, pending, s, input)
+    # themselves: ones select them.
     queue = np.eye(pending + m, lagged + pending + s + m, k=lagged)
     queue[pending:] = np.eye(m, c + m, k=c)
     command = queue[:m]

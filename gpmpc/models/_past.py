@@ -39,7 +39,7 @@ class ModelWithPast(DynamicsModel, Protocol):
         ...
 
     def follow(self, state: Array, input: Array, measured: Array) -> Array:
-        """Returns the state (n,) that a measurement says.
+        """Returns the next state (n,): what was measured, and the past a row later.
 
         Args:
             state: That of the step before (n,).
@@ -55,9 +55,9 @@ def measured_dim(model: Any) -> int:
 
 
 def weighed_dim(model: DynamicsModel, problem: Any) -> int:
-    """Returns the number of states that a controller's problem is to weigh.
+    """Returns the number of states that a controller's problem weighs.
 
-    They are all of the model's, or those that are measured where it weighs as many.
+    They are those that are measured where its dimension says so, and else all.
     """
     measured = measured_dim(model)
     weighs_measured = getattr(problem, "state_dim", None) == measured

@@ -75,8 +75,8 @@ def log_model_parts(
     """Returns the header and the tensors of a model of a log.
 
     Raises:
-        SettingError: The nominal model is a user's own, which a file of numbers cannot
-            hold.
+        SettingError: The nominal model is of no kind that a file holds: those of gpmpc
+            and, by the name of its code, a user's system.
     """
     model = named.model
     tensors = {
@@ -196,7 +196,7 @@ def log_model_of_parts(
     if "namings" in header:
         sizes = (kinematics.space.dim, len(input_names))
         namings = _namings(header["namings"], *sizes)
-    log = _LogOfModel(
+    origin = _ModelOrigin(
         path=path,
         kinematics=kinematics,
         state_names=state_names,
@@ -206,7 +206,7 @@ def log_model_of_parts(
         namings=namings,
         trusted=tuple(trusted),
     )
-    model = _model(header, tensors, log)
+    model = _model(header, tensors, origin)
     noise = OutputNoise(
         outputs=tensors["noise/outputs"].numpy(),
         measurement=tensors["noise/measurement"].numpy(),
@@ -215,10 +215,10 @@ def log_model_of_parts(
     named = NamedLogModel(
         model=model,
         noise=noise,
-        state_names=log.state_names,
-        input_names=log.input_names,
-        context_names=log.context_names,
-        time_step=log.time_step,
+        state_names=origin.state_names,
+        input_names=origin.input_names,
+        context_names=origin.context_names,
+        time_step=origin.time_step,
         namings=namings,
     )
     _check_named(named)
@@ -242,30 +242,30 @@ def _namings(fields: Any, states: int, inputs: int) -> Namings:
 
 
 def _model(
-    header: Mapping[str, Any], tensors: Mapping[str, Tensor], log: "_LogOfModel"
+    header: Mapping[str, Any], tensors: Mapping[str, Tensor], origin: "_ModelOrigin"
 ) -> LogModel:
     """Makes the model of a header and tensors, and checks its sizes.
 
     Raises:
         DataError: The parts do not belong together.
     """
-    kinematics = log.kinematics
-    input_names = log.input_names
+    kinematics = origin.kinematics
+    input_names = origin.input_names
     features = kinematics.features(
         states=kinematics.space.origin[None],
         inputs=np.zeros((1, len(input_names))),
-        context=np.zeros((1, len(log.context_names))),
+        context=np.zeros((1, len(origin.context_names))),
     )
     feature_count = features.shape[1]
     memory = _memory(header.get("memory"))
     regressor_count = memory.regressor_dim(feature_count, len(header["history"]))
     model = LogModel(
         kinematics=kinematics,
-        nominal=_nominal(header["nominal"], log),
+        nominal=_nominal(header["nominal"], origin),
         theta=tensors["theta"].numpy(),
         history=tuple(header["history"]),
         lag=header["lag"],
-        gps=_gps(header["gps"], tensors, log.path),
+        gps=_gps(header["gps"], tensors, origin.path),
         correction=_correction(header, tensors, kinematics, input_names, feature_count),
         start_filter=_start_filter(tensors, kinematics, input_names, feature_count),
         time_constants=_numbers(tensors, "time_constants", (0,)),
@@ -349,8 +349,8 @@ def _kinematics(name: str, space: StateSpace) -> Kinematics:
     return RigidBodyKinematics(space)
 
 
-class _LogOfModel(NamedTuple):
-    """What a model in a file is of, and whose code the file may name."""
+class _ModelOrigin(NamedTuple):
+    """Where a model comes from: its file, its signals, whose code it may name."""
 
     path: Path
     kinematics: Kinematics
@@ -363,7 +363,7 @@ class _LogOfModel(NamedTuple):
 
 
 def _nominal(
-    name_and_settings: Any, log: _LogOfModel
+    name_and_settings: Any, origin: _ModelOrigin
 ) -> MultirotorNominal | AffineNominal | GroupedNominal | SystemNominal:
     """Makes a nominal model of its name and settings.
 
@@ -372,12 +372,12 @@ def _nominal(
     """
     name, settings = name_and_settings
     if name in _AFFINE_NAMES:
-        return AffineNominal(log.kinematics, settings.get("fitted", name != STILL))
+        return AffineNominal(origin.kinematics, settings.get("fitted", name != STILL))
     if name == _SYSTEM_NAME:
-        return _system_nominal(settings, log)
+        return _system_nominal(settings, origin)
     if name == _GROUPED_NAME:
         return GroupedNominal(
-            parts=tuple(_nominal(part, log) for part in settings["parts"]),
+            parts=tuple(_nominal(part, origin) for part in settings["parts"]),
             outputs_of=tuple(tuple(outputs) for outputs in settings["outputs_of"]),
             sizes=tuple(settings["sizes"]),
         )
@@ -386,19 +386,19 @@ def _nominal(
         names = ", ".join(own)
         raise DataError(f"unknown nominal model {name!r:.80}; known are {names}")
     motors = settings["motors"]
-    inputs = len(log.input_names)
+    inputs = len(origin.input_names)
     if type(motors) is not int or motors != inputs:
         raise DataError(f"a multirotor of {inputs} inputs has no {motors!r:.80} motors")
     voltage = settings.get("voltage", 0.0)
     check_number("voltage", voltage, least=0)
-    if voltage and not log.context_names:
+    if voltage and not origin.context_names:
         raise DataError("a multirotor whose voltage counts has it in its context")
-    if not isinstance(log.kinematics, RigidBodyKinematics):
+    if not isinstance(origin.kinematics, RigidBodyKinematics):
         raise DataError("a multirotor is a rigid body")
     return MultirotorNominal(**settings)
 
 
-def _system_nominal(settings: Mapping[str, Any], log: _LogOfModel) -> SystemNominal:
+def _system_nominal(settings: Mapping[str, Any], origin: _ModelOrigin) -> SystemNominal:
     """Makes a system of the code and the parameters that a file names.
 
     Raises:
@@ -408,14 +408,14 @@ def _system_nominal(settings: Mapping[str, Any], log: _LogOfModel) -> SystemNomi
     if code in SYSTEM_CODE:
         factory = trusted_code(code, ["gpmpc"])
     else:
-        check_code_name(log.path, "nominal", code, log.trusted)
-        factory = trusted_code(code, log.trusted)
-    if not isinstance(log.kinematics, Increments):
+        check_code_name(origin.path, "nominal", code, origin.trusted)
+        factory = trusted_code(code, origin.trusted)
+    if not isinstance(origin.kinematics, Increments):
         raise DataError("the states of a system are no rigid body's")
     fixed = settings["fixed"]
     # Older files do not say how the system calls what the fit took.
-    states = settings.get("states", list(log.kinematics.space.names))
-    columns = log.namings.first_inputs or log.input_names
+    states = settings.get("states", list(origin.kinematics.space.names))
+    columns = origin.namings.first_inputs or origin.input_names
     inputs = settings.get("inputs", list(columns))
     for name, value in fixed.items():
         if not isinstance(value, bool | int | float | str):
@@ -432,7 +432,7 @@ def _system_nominal(settings: Mapping[str, Any], log: _LogOfModel) -> SystemNomi
             )
             for name, start, low, high in settings["fitted"]
         ),
-        time_step=log.time_step,
+        time_step=origin.time_step,
         state_names=texts("states", states),
         input_names=texts("inputs", inputs),
         fixed=fixed,
