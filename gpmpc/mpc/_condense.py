@@ -228,7 +228,7 @@ def _add_constant_stages(cost, stages, E, H, P, G):
     A_transposed = _zeros(p, p)
     W = _padded(cost.state[0])
     terminal_W = _padded(cost.terminal)
-    same_weights = np.array_equal(cost.state[0], cost.terminal)
+    same_weights = _are_equal(cost.state[0], cost.terminal)
     for i in range(p):
         for j in range(p):
             A_transposed[j, i] = stages.A[0, i, j]
@@ -390,8 +390,11 @@ def condense_with_feedback(cost, bounds, stages, start, references, rows):
             copy(inputs[0], G[size + rate_rows + k * r + e, :width])
             inputs[0, here:width] = 0.0
     previous_input = references.previous_input
-    lower = np.full(size + row_count, -np.inf)
-    upper = np.full(size + row_count, np.inf)
+    lower = np.empty(size + row_count)
+    upper = np.empty(size + row_count)
+    for row in range(size + row_count):
+        lower[row] = -np.inf
+        upper[row] = np.inf
     program = CondensedProgram(P, np.zeros(size), G, lower, upper, feedback)
     free_inputs, free = expand(stages, start, feedback, previous_input, program.q)
     _write_bounds(bounds, rows, free_inputs, free, previous_input, size, program)
@@ -437,6 +440,22 @@ def _zeros(rows, columns):
     matrix = aligned_rows(rows, (columns + 7) // 8 * 8)
     matrix[:] = 0.0
     return matrix
+
+
+@njit_noalloc
+def _are_equal(W, V):
+    """Returns whether two weights of the same shape (b, n, n) are equal.
+
+    numba takes half a second to compile ``np.array_equal``, and as long for
+    ``np.full``.
+    """
+    b, n, m = W.shape
+    for block in range(b):
+        for i in range(n):
+            for j in range(m):
+                if W[block, i, j] != V[block, i, j]:
+                    return False
+    return True
 
 
 @njit_inner

@@ -164,7 +164,8 @@ def evaluate_stages(cost, states, inputs, references, constant):
     m = inputs.shape[1]
     error = np.empty(states.shape[1])
     v = np.empty(m)
-    z = np.full(n + m + 1, constant)
+    z = np.empty(n + m + 1)
+    z[n + m] = constant
     costs = np.empty(H)
     for k in range(H):
         copy(states[k + 1], error)
