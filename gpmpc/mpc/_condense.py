@@ -126,7 +126,7 @@ def _condense(cost, bounds, stages, start, references, rows, program):
         if i >= m:
             G[i, i - m] = -1.0
     constant = len(stages.A) == len(rows.E) == len(cost.state) == 1
-    if constant and len(cost.squares) == 0:
+    if constant and len(rows.D) == len(cost.squares) == 0:
         _add_constant_stages(cost, stages, rows.E[0], H, P, G[rate_rows:])
     else:
         _add_varying_stages(cost, stages, rows, H, P, G[rate_rows:])

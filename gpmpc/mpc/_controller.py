@@ -47,6 +47,7 @@ class Reference:
 
     Raises:
         ShapeError: States, inputs and kappas do not belong together.
+        SettingError: A kappa is negative or no number.
 
     >>> import numpy as np
     >>> Reference(np.zeros((11, 2)), inputs=np.zeros((10, 1))).states.shape
@@ -94,6 +95,8 @@ class Reference:
             raise ShapeError(f"reference inputs must be ({H}, m); got {inputs_shape}")
         if self.kappas is not None and np.shape(self.kappas) != (H,):
             raise ShapeError(f"kappas must be ({H},); got {np.shape(self.kappas)}")
+        if self.kappas is not None and not (np.asarray(self.kappas) >= 0).all():
+            raise SettingError("kappas", f"must not be negative; got {self.kappas}")
 
     def _read_names(self) -> None:
         """Turns series and tables into arrays, whose names are known then."""

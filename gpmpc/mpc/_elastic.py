@@ -13,7 +13,8 @@ no plan that is better under it costs more than J0 + WORTH J, at most five times
 that is what its violations may cost. J is the cost of the last plan within these
 limits: where that keeps the bound at some cost, the bound is worth more. A plan that
 costs nothing has no scale; what it would cost to be beside its reference by its
-violations is added.
+violations is added. A direction that the cost does not weigh counts there as its
+largest weight does: else a bound in it would count for nothing.
 """
 
 import numpy as np
@@ -62,6 +63,8 @@ def elastic_price(
     of_stages = _by_stage(Q.reshape(-1, n, n), len(missed))
     weights = np.einsum("kri,kij,krj->kr", gradients, of_stages, gradients)
     squares = (gradients**2).sum(axis=2)
+    largest = np.linalg.eigvalsh(of_stages).max(axis=1, keepdims=True) * squares
+    weights = np.where(weights > _TINY * largest, weights, largest)
     # The cheapest move by a violation v along a gradient g has the size v / |g|.
     beside = weights / np.maximum(squares, _TINY) ** 2 * missed**2
     cost = min(max(free_cost, last_cost), 2.0 * free_cost)

@@ -1,9 +1,13 @@
 """The checks of a flight's step, compiled.
 
 ``judge_step`` takes a step into the memory of its flight and returns the first alarm.
-Functions ``_follow_*`` and ``_remember_*`` write the memory, each of them once a step;
-``_check_*`` only read. The tuple ``alarms`` is the list of alarms, in the order in
-which they are named to the user. What they are for is told in ``_judgement``.
+Functions ``_follow_*`` and ``_remember_*`` write the memory, each of them once a step,
+and ``judge_step`` itself counts the steps; ``_check_*`` only read. The tuple ``alarms``
+is the list of alarms, in the order in which they are named to the user. What they are
+for is told in ``_judgement``.
+
+A measurement that is missing is NaN. It is no innovation, it tells nothing of its
+sensor, and the plant counts as where the last plan predicted it.
 """
 
 import math
@@ -194,7 +198,7 @@ def judge_step(settings, memory, reading):
     # variances, and a promise is followed after the news that may withdraw it.
     innovation, bias = _follow_innovations(settings, memory, reading)
     frozen = _follow_sensors(memory, reading.measured)
-    distance = _measure_distance(settings, memory, reading)
+    distance = _follow_distance(settings, memory, reading)
     _remember_reference(settings, memory, reading.reference)
     _remember_first_cost(flight, cost)
     promise_ratio = _follow_promise(flight, distance, promised, horizon)
@@ -253,7 +257,7 @@ def _follow_innovations(settings, memory, reading):
         innovation = _wrapped(
             reading.measured[i] - reading.last_means[1, i], settings.angles[i]
         )
-        ratio, deviation = _score_innovation(settings, state, reading, i)
+        ratio, deviation = _follow_innovation(settings, state, reading, i)
         slot = flight.step % WINDOW
         state.ratio += ratio - state.ratios[slot]
         state.ratios[slot] = ratio
@@ -273,7 +277,7 @@ def _follow_innovations(settings, memory, reading):
 
 
 @njit_noalloc
-def _score_innovation(settings, state, reading, i):
+def _follow_innovation(settings, state, reading, i):
     """A state's squared innovation over its variance, and itself over its deviation.
 
     The variance is the predicted one, the noise that the model has learned, that of
@@ -373,6 +377,8 @@ def _follow_sensors(memory, measured):
     changing = 0
     for i in range(len(measured)):
         state = memory.states[i]
+        if measured[i] != measured[i]:
+            continue
         if measured[i] == state.measured:
             state.repeats += 1.0
         else:
@@ -391,10 +397,12 @@ def _follow_sensors(memory, measured):
 
 
 @njit_noalloc
-def _measure_distance(settings, memory, reading):
+def _follow_distance(settings, memory, reading):
     """The distance from the reference in the cost's metric, and the least that matters.
 
-    No distance matters that is small beside the way travelled, or beside noise.
+    No distance matters that is small beside the way travelled, or beside noise. Where
+    nothing is known of a state the distance stays as it was; it is infinite before any
+    is known.
     """
     flight = memory.flight[0]
     n = len(reading.measured)
@@ -409,12 +417,13 @@ def _measure_distance(settings, memory, reading):
     noise = 0.0
     for i in range(n):
         state = memory.states[i]
-        off = _wrapped(reading.measured[i] - now[i], settings.angles[i])
+        present = _present(reading, i)
+        off = _wrapped(present - now[i], settings.angles[i])
         way = _wrapped(end[i] - state.start, settings.angles[i])
         for j in range(n):
             weight = settings.weights[i, j]
             if weight != 0.0:
-                off_j = _wrapped(reading.measured[j] - now[j], settings.angles[j])
+                off_j = _wrapped(_present(reading, j) - now[j], settings.angles[j])
                 square += weight * off * off_j
                 way_j = _wrapped(end[j] - memory.states[j].start, settings.angles[j])
                 travel += weight * way * way_j
@@ -422,13 +431,24 @@ def _measure_distance(settings, memory, reading):
         predicted = reading.last_covariances[1, i, i]
         if predicted == predicted:
             variance += predicted
-        size = _ROUNDING * max(1.0, abs(reading.measured[i]))
+        size = _ROUNDING * max(1.0, abs(present))
         noise += settings.weights[i, i] * (variance + size * size)
     travel = math.sqrt(max(0.0, travel))
     if travel == travel:
         flight.travel = max(flight.travel, travel)
     least = max(_MATERIAL * flight.travel, 4.0 * math.sqrt(noise))
-    return _Distance(math.sqrt(max(0.0, square)), least)
+    if square == square:
+        return _Distance(math.sqrt(max(0.0, square)), least)
+    if flight.step == 0:
+        return _Distance(np.inf, least)
+    return _Distance(flight.distances[(flight.step - 1) % _RING], least)
+
+
+@njit_noalloc
+def _present(reading, i):
+    """Where a state is: as it was measured, or else as the last plan predicted it."""
+    measured = reading.measured[i]
+    return measured if measured == measured else reading.last_means[1, i]
 
 
 @njit_noalloc

@@ -233,6 +233,7 @@ class ControlLoop:
         self._before_last: Command | None = None
         # Of the last state; plans may be of more. None before the first call.
         self._measured_dim: int | None = None
+        self._parameters: Any = None  # of the last call
         # The last plan whose feedback was needed, and its gains (H, m, n).
         self._gains: tuple[Decision, np.ndarray] | None = None
 
@@ -264,8 +265,7 @@ class ControlLoop:
         if followed.signals is not UNKNOWN:
             followed = followed.in_order(signals)
         self._measured_dim = belief.mean.shape[-1]
-        self._before_last = self.last
-        self.last = decide(
+        command = decide(
             self.controller,
             belief,
             followed,
@@ -275,10 +275,13 @@ class ControlLoop:
             parameters=parameters,
             plan=plan,
         )
-        self.failures = self.failures + self.last.failed
+        self._before_last = self.last
+        self._parameters = parameters
+        self.last = command
+        self.failures = self.failures + command.failed
         self._steps = self._steps + 1
-        self.judgement = self._judge_step(belief, followed, self.last)
-        return self.last.input.copy()
+        self.judgement = self._judge_step(belief, followed, command)
+        return command.input.copy()
 
     def _judge_step(
         self, belief: Gaussian, reference: Reference, command: Command
@@ -327,15 +330,20 @@ class ControlLoop:
             planned_state = _state_along(plan.means[:, :n], min(share, horizon))
             error = self._short_way(state - planned_state)
             input = input - self._gains_of(plan)[stage][:, :n] @ error
-        return _within_bounds(self.controller, input, self._before_last)
+        last_input = _input_of(self.controller, self._before_last)
+        if stage > 0:
+            last_input = plan.inputs[stage - 1]
+        return _within_bounds(self.controller, input, last_input)
 
     def _gains_of(self, plan: Decision) -> np.ndarray:
         """Returns the gains (H, m, n) of a plan's feedback; zero without any."""
         if self._gains is None or self._gains[0] is not plan:
             method = getattr(self.controller, "gains", None)
             gains = np.zeros((*plan.inputs.shape, plan.means.shape[1]))
-            if method is not None:
+            if method is not None and self._parameters is None:
                 gains = method(plan)
+            elif method is not None:
+                gains = method(plan, self._parameters)
             self._gains = (plan, gains)
         return self._gains[1]
 
@@ -453,7 +461,9 @@ def _plan_without_prediction(
         known_input = reference.inputs[0]
     if known_input is None or not np.isfinite(known_input).all():
         return None
-    input = _within_bounds(controller, np.array(known_input, dtype=float), last)
+    input = _within_bounds(
+        controller, np.array(known_input, dtype=float), _input_of(controller, last)
+    )
     H = reference.horizon
     n = reference.states.shape[1]
     return Decision(
@@ -489,7 +499,7 @@ def _admit(
 
     None where it must not be applied.
     """
-    input = _within_bounds(controller, plan.input, last)
+    input = _within_bounds(controller, plan.input, _input_of(controller, last))
     miss = np.abs(input - plan.input)
     tolerance = _ROUNDING * np.maximum(1.0, np.abs(input))
     is_rounding = (miss <= tolerance).all()  # the miss of a NaN is a NaN
@@ -500,8 +510,15 @@ def _admit(
     return _with_first(plan, plan.inputs, input)
 
 
+def _input_of(controller: Controller, last: Command | None) -> np.ndarray | None:
+    """Returns the input of a command, or the one before the first; None if unknown."""
+    if last is not None:
+        return last.input
+    return getattr(controller, "initial_input", None)
+
+
 def _within_bounds(
-    controller: Controller, input: np.ndarray, last: Command | None
+    controller: Controller, input: np.ndarray, last_input: np.ndarray | None
 ) -> np.ndarray:
     """Returns the nearest input in the box and, among these, within the rates.
 
@@ -510,9 +527,6 @@ def _within_bounds(
     problem = getattr(controller, "problem", None)
     if not isinstance(problem, Problem):
         return input
-    last_input = getattr(controller, "initial_input", None)
-    if last is not None:
-        last_input = last.input
     if last_input is not None:
         down, up = problem.input_rates.first
         input = np.minimum(np.maximum(input, last_input + down), last_input + up)

@@ -31,11 +31,16 @@ class Question(NamedTuple):
         inputs = reference.inputs
         if inputs is not None:
             inputs = held(np.asarray(inputs), horizon)
+        kappas = reference.kappas
+        if kappas is not None:
+            kappas = held(np.asarray(kappas), horizon)
         states = held(np.asarray(reference.states), horizon + 1)
         parameters = self.parameters
         if parameters is not None:
             parameters = rows_over(parameters, horizon)
-        return self._replace(reference=Reference(states, inputs), parameters=parameters)
+        return self._replace(
+            reference=Reference(states, inputs, kappas), parameters=parameters
+        )
 
     def after(self, stages: int) -> "Question":
         """Returns the question some stages later.

@@ -252,12 +252,14 @@ class Globalization:
         scale = forecast.cost + self._cost_floor
         offset = math.sqrt(forecast.squared_length / scale)
         self._progress = self._progress.after(max(offset, forecast.defect))
-        if self._progress.is_converged(self._tolerance):
+        # A solver that stopped early may propose no step far from the optimum.
+        is_optimum = solution.status.solved
+        if is_optimum and self._progress.is_converged(self._tolerance):
             return Iterate(local._replace(plan=proposed), Status.SOLVED)
         trial = self._search_line(local, program, proposed, forecast)
         if trial is not None:
             return Iterate(trial, status=None)
-        return self._end_without_step(local, proposed)
+        return self._end_without_step(local, proposed, is_optimum)
 
     def _raise_hard_price(self, multipliers: Array) -> None:
         """Raises the price of hard rows above their multipliers (H, r)."""
@@ -336,13 +338,15 @@ class Globalization:
         matches_moments = not self._prediction.linearizer.needs_no_covariance
         return matches_moments or progress.creeps or far
 
-    def _end_without_step(self, local: LocalProblem, proposed: Plan) -> Iterate:
+    def _end_without_step(
+        self, local: LocalProblem, proposed: Plan, is_optimum: bool
+    ) -> Iterate:
         """Returns how an iteration ends whose line search found no plan."""
         size = self._progress.size
         # What could still be gained: the offset's square is a share of the cost.
-        if size**2 <= _ROUND_OFF:
+        if is_optimum and size**2 <= _ROUND_OFF:
             return Iterate(local._replace(plan=proposed), Status.SOLVED)
-        if size**2 <= _SLIGHT and size <= _NEARLY * self._tolerance:
+        if is_optimum and size**2 <= _SLIGHT and size <= _NEARLY * self._tolerance:
             return Iterate(local, Status.SOLVED)
         goes_on = self._curvature.forget()  # the updates may be what misleads
         status = None if goes_on else Status.STALLED

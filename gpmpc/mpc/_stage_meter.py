@@ -11,6 +11,7 @@ import numpy as np
 
 from gpmpc.mpc._constraints import ConstraintRows
 from gpmpc.mpc._controller import FEASIBLE
+from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._linear_quadratic import Plan
 from gpmpc.mpc._question import Question, held, rows_over
 from gpmpc.mpc.problem import Problem
@@ -55,7 +56,8 @@ class StageMeter:
     def functions(self, states: Array, inputs: Array, parameters: Any) -> Array:
         """Returns the costs of outputs and of violated constraints (L,).
 
-        They are evaluated for a horizon at a time; see ``__call__``.
+        They are evaluated for a horizon at a time; see ``__call__``. Where a function
+        or its slope is not finite, a horizon's costs are infinite.
         """
         count = len(inputs)
         costs = np.zeros(count)
@@ -70,8 +72,11 @@ class StageMeter:
             chunk_parameters = None
             if parameters is not None:
                 chunk_parameters = rows_over(parameters, first + H)[first:]
-            chunk = self._outputs(chunk_states, chunk_inputs, chunk_parameters)
-            chunk += self._violations(chunk_states, chunk_inputs, chunk_parameters)
+            try:
+                chunk = self._outputs(chunk_states, chunk_inputs, chunk_parameters)
+                chunk += self._violations(chunk_states, chunk_inputs, chunk_parameters)
+            except FunctionNotFinite:
+                chunk = np.full(H, np.inf)
             costs[first:end] = chunk[: end - first]
         return costs
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
@@ -50,10 +51,12 @@ class Starts:
             raise ShapeError(f"guesses must be None or inputs ({H}, {m}); got {shapes}")
         self.guesses = guesses
         count = len(self._angles)
-        self.turns = [turns] * count if isinstance(turns, int) else list(turns)
-        if len(self.turns) != count or min(self.turns, default=1) < 1:
+        numbers = [turns] * count if np.ndim(turns) == 0 else list(turns)
+        are_whole = all(isinstance(number, Integral) for number in numbers)
+        if len(numbers) != count or not are_whole or min(numbers, default=1) < 1:
             rule = f"must be whole numbers from 1 on, one for each of {count} angles"
-            raise SettingError("turns", rule)
+            raise SettingError("turns", f"{rule}; got {turns!r}")
+        self.turns = [int(number) for number in numbers]
 
     def __len__(self) -> int:
         return len(self.guesses) * math.prod(self.turns)
@@ -128,8 +131,7 @@ def kicks(
     """
     drift = np.tile(np.asarray(initial_input, dtype=float), (horizon, 1))
     length = max(1, horizon // 6)
-    upper = problem.inputs.upper
-    lower = problem.inputs.lower
+    lower, upper = problem.inputs.first
     guesses = [drift]
     for j, (first, second) in product(
         range(problem.input_dim), ((upper, lower), (lower, upper))

@@ -29,7 +29,6 @@ from gpmpc.mpc._controller import (
     Decision,
     Reference,
     check_arguments,
-    read_parameters,
 )
 from gpmpc.mpc._foresight import Flight, Foresight, Trajectory
 from gpmpc.mpc._linear_quadratic import References, evaluate_cost
@@ -144,19 +143,25 @@ class _Memory(NamedTuple):
     def passed(self, decision: Decision, horizon: int) -> "_Memory":
         """Returns it with its flight from a decision's step on.
 
-        A failed step may have left that behind. Of a flight that is no longer than a
-        horizon a plan of H stages sees as much: it is dropped.
+        A failed step may have left stages behind, which are paid by now. Of a flight
+        that is no longer than a horizon a plan of H stages sees as much: it is dropped.
         """
         if self.flight is None:
             return self
         expected = (self.flight.states == decision.means[0]).all(axis=1)
-        passed_stages = np.flatnonzero(expected)
-        flight = None
-        if len(passed_stages):
-            flight = self.flight.after(int(passed_stages[0]))
-        if flight is not None and len(flight) <= horizon:
-            flight = None
-        return self._replace(flight=flight)
+        stages = np.flatnonzero(expected)
+        if not len(stages):
+            return self._replace(flight=None)
+        passed_count = int(stages[0])
+        flight = self.flight.after(passed_count)
+        costs = self.costs
+        if passed_count > 0:
+            costs = flight.costs[:horizon]
+        return self._replace(
+            remaining=self.remaining - float(self.flight.costs[:passed_count].sum()),
+            costs=costs,
+            flight=flight if len(flight) > horizon else None,
+        )
 
 
 @dataclass(frozen=True)
@@ -367,9 +372,9 @@ class ManyStarts:
     def __len__(self) -> int:
         return len(self.starts)
 
-    def gains(self, decision: Decision) -> Array:
+    def gains(self, decision: Decision, parameters: Any = None) -> Array:
         """Returns those of ``controller``."""
-        return self.controller.gains(decision)
+        return self.controller.gains(decision, parameters)
 
     def _can_continue(self, previous: Decision) -> bool:
         return previous.applicable and len(previous.means) == self.horizon + 1
@@ -574,7 +579,7 @@ class ManyStarts:
                 continue
             different.append(inputs)
             if not self.planner.prediction.settings.rolled_out:
-                gains = self._plan_gains(self.planner, decision, question.parameters)
+                gains = self.planner.gains(decision, question.parameters)
                 states, inputs = foresight.roll_out(
                     states, inputs, gains, state, question
                 )
@@ -606,7 +611,7 @@ class ManyStarts:
             limit = cost / (1.0 + _KEPT)
         if self._plan_cost(means, inputs, question) >= limit:
             return decision
-        gains = self._plan_gains(self.controller, previous, situation.parameters)
+        gains = self.controller.gains(previous, situation.parameters)
         gains = np.concatenate([gains[1:], gains[-1:]])
         states, inputs = self._foresight.roll_out(
             means, inputs, gains, situation.state, question
@@ -619,14 +624,6 @@ class ManyStarts:
         """Returns the turn of a reference whose end is nearest to a state (n,)."""
         turns = full_turns(end - reference.states[-1], self._angles)
         return turned(reference, turns)
-
-    def _plan_gains(
-        self, controller: GPMPC, decision: Decision, parameters: Any
-    ) -> Array:
-        """Returns the gains (H, m, n) of a controller along a plan."""
-        if parameters is None:
-            return controller.gains(decision, None)
-        return controller.gains(decision, read_parameters(parameters, self.horizon))
 
     def _plan_cost(self, means: Array, inputs: Array, question: Question) -> float:
         """Returns the cost of a plan, violated constraints included.

@@ -49,6 +49,7 @@ from gpmpc.mpc._controller import (
     Request,
     Timing,
     check_method,
+    read_parameters,
 )
 from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._elastic import elastic_price, violations
@@ -304,16 +305,20 @@ class GPMPC:
             return quick
         try:
             thorough = self._improve(local, request, stopwatch, self._most_programs)
-        except FAILURES:  # more programs led the model out of its numbers
+            pays = thorough.applicable and self._pays(thorough, quick, request)
+        except FAILURES:  # more programs, or a plan's inputs, led out of its numbers
             return quick
-        quick_cost = cost_of_inputs(self.prediction, quick.inputs, request)
-        thorough_cost = cost_of_inputs(self.prediction, thorough.inputs, request)
-        pays = thorough.applicable and thorough_cost < _PAYS * quick_cost
         return replace(
             thorough if pays else quick,
             iterations=quick.iterations + thorough.iterations,
             timing=stopwatch.timing,
         )
+
+    def _pays(self, thorough: Decision, quick: Decision, request: Request) -> bool:
+        """Returns whether the inputs of a decision cost much less than another's."""
+        thorough_cost = cost_of_inputs(self.prediction, thorough.inputs, request)
+        quick_cost = cost_of_inputs(self.prediction, quick.inputs, request)
+        return thorough_cost < _PAYS * quick_cost
 
     def _is_late(self, stopwatch: Stopwatch) -> bool:
         """Returns whether a decision has spent its budget."""
@@ -366,11 +371,14 @@ class GPMPC:
         other.prediction = self.prediction.with_model(model)
         return other
 
-    def gains(self, decision: Decision, parameters: Array | None = None) -> Array:
+    def gains(self, decision: Decision, parameters: Any = None) -> Array:
         """Returns K_0 .. K_{H-1} (H, m, n) of u = u_k - K_k (x - x_k).
 
-        They are those of the regulator of the stages along a decision's plan.
+        They are those of the regulator of the stages along a decision's plan;
+        ``parameters`` are those that it was decided with.
         """
+        if parameters is not None:
+            parameters = read_parameters(parameters, self.horizon)
         local = linearize(
             self.prediction.model,
             decision.means[:-1],
@@ -709,7 +717,9 @@ class _ControlStep:
             if not suboptimal:
                 return self._failed_decision(solution, status)
         violation = self._violation(local)
-        if status is Status.SOLVED and violation > KEPT:
+        constraints = self._prediction.constraints
+        gives_way = constraints.soft or constraints.smooth
+        if gives_way and status is Status.SOLVED and violation > KEPT:
             status = Status.SOFT_BOUND_MISSED
         means, covariances = self._prediction.linearizer.moments(
             plan.states, local.covariances

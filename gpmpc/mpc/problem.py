@@ -100,8 +100,10 @@ class Constraint:
 
     def _read_stages(self) -> tuple[int, ...]:
         """Returns the stages as a tuple of whole numbers from 1 on."""
-        stages = tuple(self.stages) if isinstance(self.stages, Iterable) else ()
-        whole = all(isinstance(stage, int) and stage > 0 for stage in stages)
+        stages = ()
+        if isinstance(self.stages, Iterable):
+            stages = tuple(np.asarray(list(self.stages)).tolist())
+        whole = all(type(stage) is int and stage > 0 for stage in stages)
         if not (stages and whole):
             rule = "must be whole numbers from 1 on"
             raise SettingError("stages", f"{rule}; got {self.stages!r}")

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import SettingError, SolverFailure
+from gpmpc.models import KnownModel
 from gpmpc.mpc import GPMPC, Box, ControlLoop, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
@@ -86,3 +87,19 @@ def test_a_loop_that_may_not_go_on_says_so():
         ControlLoop(controller(), "raise").input([np.nan, 0.0], GOAL)
     assert ControlLoop(controller()).input([np.nan, 0.0], GOAL) == pytest.approx([0.0])
     assert Status.INVALID_MEASUREMENT.advice
+
+
+def test_a_late_decision_goes_on_along_the_plan_within_rates():
+    model = KnownModel(lambda x, u: x + u, state_dim=1, input_dim=1)
+    problem = Problem(
+        Tracking([1.0], [1e-3], penalized="inputs"),
+        inputs=Box([-1.0], [1.0]),
+        input_rates=Box([-0.1], [0.1]),
+    )
+    loop = ControlLoop(GPMPC(model, Linearization(), problem, 6, [0.0]))
+    loop.input(np.zeros(1), np.array([5.0]))
+    plan = loop.last.plan
+    assert plan.inputs[:3, 0] == pytest.approx([0.1, 0.2, 0.3])
+    assert loop.input_between(plan.means[2], 2.0) == pytest.approx([0.3])
+    behind = loop.input_between(plan.means[2] - 1.0, 2.0)
+    assert behind == pytest.approx([0.3])  # by its rate, from the planned one before

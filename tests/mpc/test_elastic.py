@@ -65,6 +65,23 @@ def test_a_reference_beyond_a_bound_does_not_make_it_free():
     assert decision.means[-1, 0] < 0.65
 
 
+def test_a_bound_of_what_the_cost_does_not_weigh_counts():
+    """The plan without the bound costs nothing, however long it rests beyond it."""
+    model = LinearGaussian(np.eye(2), np.eye(2))
+    problem = Problem(
+        Tracking([1.0, 0.0], [0.01, 0.01], penalized="inputs"),
+        Box([-0.5, -0.5], [0.5, 0.5]),
+        constraints=[Box([-np.inf, -np.inf], [np.inf, 1.0])],
+    )
+    prediction = PredictionSettings(covariance="none")
+    controller = GPMPC(model, Linearization(), problem, H, [0.0, 0.0], prediction)
+    decision = controller.control(
+        Gaussian.certain(np.array([0.0, 2.0])), Reference(np.zeros(2))
+    )
+    assert decision.status is Status.SOFT_BOUND_MISSED
+    assert decision.means[-1, 1] == pytest.approx(1.0, abs=1e-6)
+
+
 def test_a_vehicle_pushed_out_of_its_lane_returns_without_a_spin():
     """A tyre that lets go beyond a slip: what exact bounds ask for is more than it
     bears."""

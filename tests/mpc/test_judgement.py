@@ -251,6 +251,39 @@ def test_a_flight_is_judged_again_when_measurements_are_back():
     assert judged_levels[-20:] == ["healthy"] * 20
 
 
+@pytest.mark.parametrize("missing", [[], [0], [5], [5, 6], [0, 1]])
+def test_a_slow_approach_with_dropouts_is_healthy(missing):
+    judge = FlightJudge(CONTROLLER.problem)
+    way = np.zeros((110, 2))
+    way[:, 0] = 10.0 - 0.04 * np.arange(110)
+    way[:, 1] = 0.01 * (np.arange(110) % 2)
+    judgements = []
+    for k in range(100):
+        is_missing = k in missing
+        measured = np.full(2, np.nan) if is_missing else way[k]
+        means = np.full((6, 2), np.nan) if is_missing else way[k : k + 6]
+        plan = replace(plan_of(np.zeros(2)), means=means)
+        judgements.append(judge.judge(measured, np.zeros(2), plan))
+    assert set(judgements) == {Judgement()}
+
+
+def test_a_dropout_does_not_end_a_loss():
+    rollout = fly(Reversed(0, 40 * T), Dropout(100 * T, 100.5 * T), steps=110)
+    assert np.isnan(rollout.measured[100:101]).all()
+    assert levels(rollout)[95:] == ["lost"] * 15
+
+
+def test_a_frozen_sensor_is_called_across_a_dropout():
+    judge = FlightJudge(CONTROLLER.problem)
+    rng = np.random.default_rng(0)
+    for k in range(20):
+        measured = rng.normal(0.0, 0.01, 2)
+        if k >= 10:
+            measured[0] = np.nan if k == 12 else 0.005
+        judgement = judge.judge(measured, np.zeros(2), plan_of(measured))
+    assert judgement.reason.startswith("state 0 is measured the same for")
+
+
 def test_a_constraint_that_plans_keep_missing_is_suspicious():
     wall = Halfspaces([[1.0, 0.0]], [-0.5])  # the way leads through it
     beyond = fly(law=controller(constraints=[wall]), references=np.zeros(2), noise=None)

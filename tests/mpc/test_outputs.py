@@ -11,13 +11,14 @@ import torch
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Transitions, train
-from gpmpc.models import Affine, ResidualModel
+from gpmpc.models import Affine, KnownModel, ResidualModel
 from gpmpc.mpc import (
     GPMPC,
     Box,
     ControlLoop,
     Inequality,
     LeastSquares,
+    ManyStarts,
     PredictionSettings,
     Problem,
     Reference,
@@ -324,6 +325,34 @@ def test_mistakes_are_one_clear_error():
         ShapeError, match=r"or a pair \(inputs, states\); got a Plan of 3"
     ):
         controller.control(at, GOAL, plan=plan)
+
+
+def test_a_first_plan_counts_whose_inputs_lead_where_its_cost_is_not_known():
+    """The plan stays where the logarithm is finite; the model from its inputs not."""
+    model = KnownModel(lambda x, u: x + u + 5.0 * u**2, state_dim=1, input_dim=1)
+    barrier = LeastSquares(lambda x: torch.log(2.0 - x), [[0.01]])
+    problem = Problem(Tracking([1.0], [1e-3]), Box([-2.0], [2.0]), outputs=[barrier])
+    steering = GPMPC(model, Linearization(), problem, H, [0.0])
+    decision = steering.control(Gaussian.certain([0.0]), Reference([1.5]))
+    assert decision.status is Status.SOLVED
+    assert decision.means[-1, 0] == pytest.approx(1.5, abs=0.2)
+
+
+def test_feedback_between_decisions_knows_their_parameters():
+    weighed = LeastSquares(lambda x, u, p: x - p, [[1.0]])
+    model = KnownModel(lambda x, u: x + 0.1 * u, state_dim=1, input_dim=1)
+    problem = Problem(Tracking([1e-6], [0.1]), Box([-2.0], [2.0]), outputs=[weighed])
+    for controller in (
+        GPMPC(model, Linearization(), problem, H, [0.0]),
+        ManyStarts(GPMPC(model, Linearization(), problem, H, [0.0])),
+    ):
+        loop = ControlLoop(controller)
+        loop.input([0.0], np.zeros(1), parameters=[0.1])
+        plan = loop.last.plan
+        pushed = loop.input_between(plan.means[0] + 0.01, 0.0)
+        gain = controller.gains(plan, [0.1])[0, 0, 0]
+        assert gain > 0.1
+        assert pushed == pytest.approx(plan.inputs[0] - 0.01 * gain)
 
 
 def test_functions_are_checked_where_a_flight_starts():

@@ -167,6 +167,14 @@ def test_linear_functions_are_halfspaces_and_boxes_two_of_them():
             assert np.abs(plans[0].solution.z).max() > 1e-3
 
 
+def test_a_constraint_of_inputs_is_kept_over_a_horizon_of_one():
+    bound = Inequality(lambda x, u: u - 0.05, count=2, penalty=None)
+    problem = Problem(COST, FREE.inputs, constraints=[bound])
+    steering = GPMPC(integrator(), Linearization(), problem, 1, [0.0] * 2)
+    decision = steering.control(Gaussian.certain(np.zeros(2)), Reference(np.ones(2)))
+    assert decision.inputs == pytest.approx(np.full((1, 2), 0.05), abs=1e-8)
+
+
 def test_bounds_hold_at_the_stages_that_they_are_for():
     box = Box([-np.inf] * 2, [0.2, np.inf], stages=range(3, 6))
     plan = controller(box).control(

@@ -9,6 +9,7 @@ from itertools import product
 import casadi
 import numpy as np
 import pytest
+import torch
 
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
@@ -17,6 +18,7 @@ from gpmpc.mpc import (
     GPMPC,
     Box,
     ControlLoop,
+    LeastSquares,
     ManyStarts,
     PredictionSettings,
     Problem,
@@ -425,6 +427,7 @@ def test_what_cannot_be_searched_is_refused():
             "turns: must be whole numbers from 1 on, one for each of 1 angles",
         ),
         ({"turns": [1, 0]}, "turns: must be whole numbers"),
+        ({"turns": 2.0}, "turns: must be whole numbers.*; got 2.0"),
         ({"budget": 0.0}, "budget: must be a number above 0"),
     ):
         with pytest.raises(SettingError, match=message):
@@ -501,6 +504,31 @@ def test_wild_starts_of_a_double_pendulum_break_no_solve(starts):
                 assert np.isfinite(decision.means).all()
                 assert np.abs(decision.inputs).max() <= 6.0 + 1e-9
     assert count == (960 if starts > 3 else 30)
+
+
+def test_kicks_go_to_the_bounds_of_the_first_stage():
+    upper = np.linspace(1.0, 2.0, 12)[:, None] * [1.0, 3.0]
+    by_stage = Problem(Tracking([1.0], [1.0, 1.0]), Box(-upper, upper))
+    first = Problem(Tracking([1.0], [1.0, 1.0]), Box(-upper[0], upper[0]))
+    for guess, expected in zip(
+        kicks(by_stage, 12, np.zeros(2)), kicks(first, 12, np.zeros(2)), strict=True
+    ):
+        assert np.array_equal(guess, expected)
+
+
+def test_a_start_that_leaves_the_domain_of_an_output_is_no_start():
+    system = pendulum()
+    barrier = LeastSquares(lambda x: torch.log(4.0 - x[:, 1:]), [[1e-3]])
+    one = controller(system, [1.0, 0.01], [0.01], 20, outputs=[barrier])
+    loop = ControlLoop(ManyStarts(one))
+    state = np.array(system.start)
+    for _ in range(5):
+        state = step(system, state, loop.input(state, np.zeros(2)))
+        assert loop.last.decision.applicable
+    for rate in (5.0, 50.0):  # beyond the domain, and nowhere near it
+        beyond = loop.input(np.array([np.pi, rate]), np.zeros(2))
+        assert np.isfinite(beyond).all()
+    assert loop.last.decision.status is Status.FUNCTION_NOT_FINITE
 
 
 def test_between_decisions_feedback_follows_the_plan():
