@@ -4,7 +4,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import product
-from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
@@ -51,12 +50,12 @@ class Starts:
             raise ShapeError(f"guesses must be None or inputs ({H}, {m}); got {shapes}")
         self.guesses = guesses
         count = len(self._angles)
-        numbers = [turns] * count if np.ndim(turns) == 0 else list(turns)
-        are_whole = all(isinstance(number, Integral) for number in numbers)
-        if len(numbers) != count or not are_whole or min(numbers, default=1) < 1:
+        numbers = list(turns) if isinstance(turns, Sequence) else [turns] * count
+        are_whole = all(isinstance(number, int) and number > 0 for number in numbers)
+        if len(numbers) != count or not are_whole:
             rule = f"must be whole numbers from 1 on, one for each of {count} angles"
             raise SettingError("turns", f"{rule}; got {turns!r}")
-        self.turns = [int(number) for number in numbers]
+        self.turns = numbers
 
     def __len__(self) -> int:
         return len(self.guesses) * math.prod(self.turns)
