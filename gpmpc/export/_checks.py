@@ -44,7 +44,7 @@ def _check_covariance(controller: GPMPC) -> None:
     if settings.covariance not in ("zero_order", "none"):
         rule = "an exported program holds means: 'zero_order' or 'none'"
         raise SettingError("covariance", f"{rule}; got {settings.covariance!r}")
-    if not controller.prediction.linearizer.needs_no_covariance:
+    if controller.prediction.linearizer.depends_on_covariance:
         rule = "an exported covariance is linearised: Linearization()"
         got = type(controller.prediction.propagator).__name__
         raise SettingError("propagator", f"{rule}; got {got}")

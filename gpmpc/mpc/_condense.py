@@ -71,10 +71,11 @@ def condense(
         stages: Affine dynamics.
         start: s_0 (p,).
         references: To track.
-        rows: Bounds of states.
+        rows: Bounds of E s + D u.
 
     Raises:
-        ShapeError: An array is not contiguous: the kernel ignores strides.
+        ShapeError: Stages, start, rows, reference states or squares are not contiguous:
+            the kernel ignores strides.
     """
     read_arrays = (*stages, start, rows.E, rows.D, references.states, cost.squares)
     for array in read_arrays:

@@ -209,9 +209,9 @@ class Decision:
     #: estimate of the model's constant error (n,), added to its mean at every stage;
     #: None where nothing is estimated
     disturbance: Array | None = None
-    #: the solve stopped short of its tolerance, at a limit say, with a plan that keeps
-    #: its bounds and that steps towards the optimum led to (Scokaert, Mayne and
-    #: Rawlings, 1999)
+    #: whether the solve stopped short of its tolerance, at a limit say, with a plan
+    #: that keeps its bounds. It comes from steps towards the optimum, so it is better
+    #: than the guess (Scokaert, Mayne and Rawlings, 1999)
     suboptimal: bool = False
     #: predicted cost of each stage of the plan (H,), that of x_{k+1} and u_k; empty
     #: where it is not known
@@ -222,8 +222,8 @@ class Decision:
     violation: float = math.nan
     #: lengths of the steps that its programs took, squared in the metric of the cost
     steps: tuple[float, ...] = ()
-    #: ``novelty``, or what measures it when it is read: a plan of means alone does not
-    #: pay for variances
+    #: ``novelty``; or a function where no variances were computed, which is called when
+    #: ``novelty`` is read
     plan_novelty: float | Callable[[], float] = math.nan
     #: what the flight has taught a controller that learns (``gpmpc.learning``), for its
     #: next decision; with ``size``, the points of the model that decided, and

@@ -27,9 +27,9 @@ from gpmpc.status import Status
 
 Array = np.ndarray
 
-_HORIZONS = 4  # of the controller that a flight takes at most,
-_STAGES = 200  # or this many stages, where they are more
-_HELD = 6  # the goal counts as held after a sixth of a horizon near it,
+_HORIZONS = 4  # a flight takes at most so many horizons of the controller,
+_STAGES = 200  # or so many stages, where these are more
+_HELD = 6  # the goal counts as held after this part of a horizon near it,
 _FEWEST = 3  # but not after fewer stages
 _NEAR_GOAL = 0.01  # share of the dearest stage's cost that a stage near the goal has
 _STANDSTILL = 0.01  # share by which costs differ where the plant stands still
@@ -120,7 +120,8 @@ class Foresight:
     ) -> GPMPC | None:
         """Returns the controller with another horizon.
 
-        None where its problem is of this one.
+        None where its problem is declared for this horizon: bounds, weights or
+        constraints by stage.
         """
         controller = self.controller
         constraints = controller.prediction.problem.constraints

@@ -180,7 +180,7 @@ def _guess_covariances(
     covariances = np.zeros((prediction.horizon + 1, n, n))
     if prediction.settings.covariance != "none":
         covariances[0] = request.covariance
-    if prediction.linearizer.needs_no_covariance:
+    if not prediction.linearizer.depends_on_covariance:
         return covariances
     if request.previous is not None:
         covariances[1:] = request.previous.covariances[1:]

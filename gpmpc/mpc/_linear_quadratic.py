@@ -35,8 +35,8 @@ class Plan(NamedTuple):
 
     states: Array  # s_0 .. s_H (H + 1, p); s_0 is the current one
     inputs: Array  # u_0 .. u_{H-1} (H, m)
-    # Sigma_0 .. Sigma_H (H + 1, n, n) at which stages are linearised: of a first guess
-    # zero after Sigma_0 where that needs none, of a program's plan those predicted
+    # Sigma_0 .. Sigma_H (H + 1, n, n) at which stages are linearised; zero after
+    # Sigma_0 in a first guess whose stages do not depend on them
     covariances: Array
 
 
@@ -98,9 +98,9 @@ class StageRows(NamedTuple):
 class CondensedProgram(NamedTuple):
     """min 1/2 v'P v + q'v under lower <= [v; G v] <= upper.
 
-    The last of the stacked constraints are the bounds of inputs, of increments (where
-    there are such) and of E s, stage by stage: all of them in input coordinates, all
-    after H m unbounded v in feedback coordinates.
+    In input coordinates the stacked constraints are the bounds of inputs, then those of
+    increments (where there are such), then the rows of states, stage by stage. In
+    feedback coordinates H m unbounded v come before these.
     """
 
     P: Array  # (H m, H m)

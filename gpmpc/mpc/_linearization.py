@@ -152,8 +152,8 @@ class LocalProblem(NamedTuple):
 
     plan: Plan
     stages: Stages  # with ``velocity`` at the first stage only
-    # Sigma_0 .. Sigma_H (H + 1, n, n) as predicted; those of the plan, where the stages
-    # need some, are where they were linearised
+    # Sigma_0 .. Sigma_H (H + 1, n, n) as predicted, for tightening; those of the plan
+    # are the ones that the stages were linearised at
     covariances: Array
     rows: StageRows  # tightened by the covariances
     cost: QuadraticCost  # with outputs linearised at a plan
@@ -377,8 +377,8 @@ class StageLinearizer:
     See ``gpmpc.mpc._linear_quadratic`` for the covariance modes.
 
     Attributes:
-        needs_no_covariance: Whether the stages depend on means and inputs alone, so
-            that they may be linearised before any covariance is predicted.
+        depends_on_covariance: Whether the stages depend on covariances, which have to
+            be predicted first then, and not on means and inputs alone.
         noise: Variances (n,) of the noise that V holds.
     """
 
@@ -393,7 +393,7 @@ class StageLinearizer:
         first_order = getattr(propagator, "first_order", False)
         zero_order = covariance == "zero_order"
         at_means = zero_order and first_order
-        self.needs_no_covariance = covariance == "none" or at_means
+        self.depends_on_covariance = covariance != "none" and not at_means
         noisy = zero_order and getattr(propagator, "process_noise", False)
         self.noise_covariance = to_array(model.noise_covariance) if noisy else None
         self.noise = np.zeros(self._n)
@@ -405,7 +405,7 @@ class StageLinearizer:
             "zero_order": self._linearize_moments,
         }
         self._linearize: _Linearize = self._linearize_means
-        if not self.needs_no_covariance:
+        if self.depends_on_covariance:
             self._linearize = by_mode[covariance]
 
     def __call__(

@@ -173,7 +173,7 @@ def measure_novelty(
     return novelty_of(added, no_noise, covariances, scales)
 
 
-def later(
+def novelty_when_read(
     model: DynamicsModel,
     means: Array,
     inputs: Array,

@@ -33,7 +33,7 @@ def roll_out(
         feedback: Of a program, F_k (H, m, p + m + 1).
         request: Of the decision.
     """
-    if prediction.linearizer.needs_no_covariance:
+    if not prediction.linearizer.depends_on_covariance:
         plan = _follow(prediction, target, local, feedback, request)
         return prediction.linearize(plan, request)
     return _roll_out_belief(prediction, target, local, feedback, request)
@@ -58,7 +58,7 @@ def close_defects(
         feedback: Of its program; see ``roll_out``.
         request: Of the decision.
     """
-    if not prediction.linearizer.needs_no_covariance:
+    if prediction.linearizer.depends_on_covariance:
         obeying = _roll_out_belief(prediction, ending.plan, local, feedback, request)
         return obeying if np.isfinite(obeying.plan.states).all() else ending
     plan = _follow(prediction, ending.plan, local, feedback, request)

@@ -66,10 +66,13 @@ _NEAR = 0.2
 _CREEP = 0.25  # ratio of two offsets above which the Hessian is updated
 _STALL = 0.5  # what two steps leave of an offset that is lost in rounding
 _OBEYS = 1e-9  # defects, relative to the states, of a plan that was rolled out
-# How much further than the last step a step may lead, squared, to count as one more
-# of the same kind; and the share of the cost below which that does not matter.
+# A step is one more of the same kind if it is at most so many times as long, squared,
+# as the last one,
 _FURTHER = 4.0
-_SLIGHT = 1e-3
+# or if its squared length is at most this share of the cost.
+_SLIGHT_STEP = 1e-3
+# An iteration that stalls has arrived if this share of the cost could still be gained.
+_SLIGHT_GAIN = 1e-3
 _NEARLY = 5.0  # tolerances, within which an iteration that stalls has arrived
 _TINY = 1e-300
 
@@ -171,12 +174,15 @@ def measure_continuity(
     last_lengths = () if request.previous is None else request.previous.steps
     if len(last_lengths) == 0:
         return True, squared_length
-    slight = _SLIGHT * (cost + smallest_cost(prediction, request))
+    slight = _SLIGHT_STEP * (cost + smallest_cost(prediction, request))
     return squared_length <= max(slight, _FURTHER * last_lengths[0]), squared_length
 
 
 def smallest_cost(prediction: PredictionModel, request: Request) -> float:
-    """Returns the cost of an input that is small beside the last one, the cheapest."""
+    """Returns the least cost, over the inputs, of a thousandth of the last input.
+
+    It keeps relative offsets finite where a plan costs nothing.
+    """
     return _cost_of_small_input.unchecked(
         R=prediction.costs.quadratic.input[0],
         lower=prediction.limits.lower[0],
@@ -275,28 +281,32 @@ class Globalization:
         proposed: Plan,
         forecast: StepForecast,
     ) -> LocalProblem | None:
-        """Returns the first trial whose merit is lower by enough; None without one."""
+        """Returns the problem at the first trial whose merit is lower by enough.
+
+        None where no trial's is.
+        """
         progress = self._progress
         # The program's cost along the step is merit + slope t + squared_length t^2,
         # which is what it promised at t = 1.
         slope = forecast.promised - forecast.squared_length - forecast.merit
         # What can be gained is lost in the rounding of merits.
         invisible = progress.size**2 <= _ROUND_OFF
-        for length, trial in self._trials(local, program, proposed):
+        for length, candidate in self._trials(local, program, proposed):
             if invisible:
-                return trial
+                return candidate
             largest_merit = (
                 forecast.merit
                 + _SUFFICIENT_DECREASE * length * min(slope, 0.0)
                 + _ROUND_OFF * abs(forecast.merit)
             )
-            judged = trial
+            judged = candidate
             if not self._prediction.constraints.smooth:
                 # bounds stay those of the program
-                judged = trial._replace(rows=local.rows._replace(E=trial.rows.E))
+                rows = local.rows._replace(E=candidate.rows.E)
+                judged = candidate._replace(rows=rows)
             merit = _merit.unchecked(judged, self._terms, self._defect_prices)
             if merit <= largest_merit:
-                return trial
+                return candidate
         return None
 
     def _trials(
@@ -335,7 +345,7 @@ class Globalization:
         request = self._request
         continued = request.previous is not None and request.guessed_states is None
         far = progress.size > _NEAR and not (progress.is_first and continued)
-        matches_moments = not self._prediction.linearizer.needs_no_covariance
+        matches_moments = self._prediction.linearizer.depends_on_covariance
         return matches_moments or progress.creeps or far
 
     def _end_without_step(
@@ -346,7 +356,7 @@ class Globalization:
         # What could still be gained: the offset's square is a share of the cost.
         if is_optimum and size**2 <= _ROUND_OFF:
             return Iterate(local._replace(plan=proposed), Status.SOLVED)
-        if is_optimum and size**2 <= _SLIGHT and size <= _NEARLY * self._tolerance:
+        if is_optimum and size**2 <= _SLIGHT_GAIN and size <= _NEARLY * self._tolerance:
             return Iterate(local, Status.SOLVED)
         goes_on = self._curvature.forget()  # the updates may be what misleads
         status = None if goes_on else Status.STALLED
@@ -453,7 +463,7 @@ def _obeys_dynamics(local: LocalProblem) -> bool:
 
 @compiled
 def _cost_of_small_input(R, lower, upper, previous_input):
-    """Returns the cost of an input that is small beside the last one, the cheapest."""
+    """Returns the least cost, over the inputs, of a thousandth of the last input."""
     least = np.inf
     for j in range(len(R)):
         size = min(max(1.0, abs(previous_input[j])), upper[j] - lower[j]) * _SMALL

@@ -42,10 +42,12 @@ from gpmpc.status import Status
 Criterion = Callable[[Decision, Reference], float]
 
 _RISE = 0.1  # share of what a search promised by which a flight may become dearer
-_DRIFT = 0.01  # by which it may before it is improved
-_CORRECTIONS = 2  # programs that do so in a decision
-_ROOM = 1.3  # cost of a flight that may still be improved, in that of the cheapest
-_IMPROVED = 3  # flights that are
+_DRIFT = 0.01  # the same share, above which what is left of a flight is improved
+_CORRECTIONS = 2  # programs that improve it, a decision
+_ROOM = (
+    1.3  # times the cheapest flight's cost, up to which a flight is flown to its end
+)
+_FLIGHTS_IMPROVED = 3  # of a search, the cheapest ones
 _ALIKE = 0.05  # share of the range of a plan's inputs by which the same plan may differ
 _KEPT = 1e-3  # share of its cost by which a new plan may be dearer than the last one
 
@@ -224,7 +226,7 @@ class _FlightSearch:
             return None
         flights = sorted(self._flights, key=cmp_to_key(_order))
         best = foresight.hold(flights[0], question)
-        for flight in flights[:_IMPROVED]:
+        for flight in flights[:_FLIGHTS_IMPROVED]:
             if not flight.arrives or perf_counter() > self._deadline:
                 break
             candidate = best

@@ -61,7 +61,7 @@ from gpmpc.mpc._linear_quadratic import (
     expand,
 )
 from gpmpc.mpc._linearization import LocalProblem, PredictionModel, PredictionSettings
-from gpmpc.mpc._novelty import data_scales, later, novelty_of
+from gpmpc.mpc._novelty import data_scales, novelty_of, novelty_when_read
 from gpmpc.mpc._roll_out import close_defects, cost_of_inputs
 from gpmpc.mpc._sqp import FAILURES, Globalization, Iterate, measure_continuity
 from gpmpc.mpc._stability import Stability, stability
@@ -78,7 +78,7 @@ _MOST = 10  # programs of a step, where their number is not set
 _LOOSE = 1e-2  # tolerance there
 _TIGHT = 1e-6  # tolerance where it is set
 _PAYS = 0.7  # of a first plan's cost, below which one that took more programs is taken
-_SLIGHTLY_MORE = 1.02  # than its program may a plan miss a smooth constraint
+_MISS_RATIO = 1.02  # a plan may miss a curved bound by this times what its program did
 # Price of a row that does not count: a free row keeps its place among the others.
 _NEXT_TO_NOTHING = 1e-9
 
@@ -299,7 +299,7 @@ class GPMPC:
         """
         quick = self._improve(local, request, stopwatch, most_programs=1)
         linearizer = self.prediction.linearizer
-        if not (quick.applicable and linearizer.needs_no_covariance):
+        if linearizer.depends_on_covariance or not quick.applicable:
             return quick
         if self._is_late(stopwatch):
             return quick
@@ -624,10 +624,9 @@ class _ControlStep:
         globalization = self._globalization
         iterate = globalization.take_step(local, program, solution, planned.plan)
         self._squared_lengths = globalization.squared_lengths
-        tightly_solved = iterate.status is Status.SOLVED
-        if self._controller.iterations is None:  # its tolerance is a loose one
-            tightly_solved = False
-        return iterate._replace(leaves_defects=not tightly_solved)
+        is_solved = iterate.status is Status.SOLVED
+        has_loose_tolerance = self._controller.iterations is None
+        return iterate._replace(leaves_defects=not is_solved or has_loose_tolerance)
 
     def _whole_step_is_enough(self, local: LocalProblem, proposed: Plan) -> bool:
         """Returns whether to take a step whole, as in the real-time iteration.
@@ -639,9 +638,12 @@ class _ControlStep:
         if self._most_programs == 1:
             return True
         request = self._request
-        follows = self._prediction.constraints.smooth or request.previous is not None
-        may_stop_after_one = self._controller.iterations is None and follows
-        if not may_stop_after_one or self._programs > 1:
+        is_first_program = self._programs == 1
+        continues_plan = request.previous is not None
+        may_stop_after_one = self._controller.iterations is None and (
+            continues_plan or self._prediction.constraints.smooth
+        )
+        if not (is_first_program and may_stop_after_one):
             return False
         continues, squared_length = measure_continuity(
             self._prediction, request, local, proposed, self._row_prices
@@ -691,7 +693,7 @@ class _ControlStep:
         if status is None or not status.solved:
             return False
         promised = float(solution.violation().max(initial=0.0))
-        return self._violation(ending) > _SLIGHTLY_MORE * promised + KEPT
+        return self._violation(ending) > _MISS_RATIO * promised + KEPT
 
     def _violation(self, local: LocalProblem) -> float:
         """Returns by how much a plan misses a bound, at most."""
@@ -772,7 +774,9 @@ class _ControlStep:
         if linearizer.covariance == "zero_order":
             V = local.stages.V
             return novelty_of(V, linearizer.noise, covariances, scales)
-        return later(self._prediction.model, means, inputs, covariances, scales)
+        return novelty_when_read(
+            self._prediction.model, means, inputs, covariances, scales
+        )
 
 
 def _check_iterations(iterations: int | None, prediction: PredictionSettings) -> None:
