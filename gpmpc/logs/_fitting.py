@@ -14,7 +14,13 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from gpmpc._dynamics import Array
-from gpmpc.exceptions import DataError, ShapeError, check_kind, check_number
+from gpmpc.exceptions import (
+    DataError,
+    SettingError,
+    ShapeError,
+    check_kind,
+    check_number,
+)
 from gpmpc.logs._log import Log
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._log_model import LogModel
@@ -63,7 +69,8 @@ def fit_nominal(
             logarithm, count.
 
     Raises:
-        SettingError: An argument is of another kind or out of range.
+        SettingError: An argument is of another kind or out of range, or theta0 lies
+            outside of the parameters' bounds.
         ShapeError: theta0 has another length.
         DataError: No piece of the log is long enough, or the rollouts at theta0 are not
             finite.
@@ -81,9 +88,13 @@ def fit_nominal(
     windows = log.windows(steps, past=max(model.past, PAST), most=_WINDOWS)
     lags = len(model.time_constants)
     theta0 = np.concatenate([theta0, np.full(lags, _FIRST_TIME_CONSTANT)])
+    bounds = _bounds(model, lags)
+    if not ((bounds[0] <= theta0) & (theta0 <= bounds[1])).all():
+        rule = "must lie between the parameters' bounds"
+        raise SettingError("theta0", f"{rule}; got {theta0[:count].tolist()}")
     if not len(theta0):
         return NominalFit(replace(model, theta=theta0), standard_errors=theta0)
-    residuals = _RolloutResiduals(model, windows, steps, _bounds(model, lags))
+    residuals = _RolloutResiduals(model, windows, steps, bounds)
     theta = _minimize(residuals, theta0)
     time_constants = np.maximum(theta[count:], 0.0)
     standard_errors = _standard_errors(

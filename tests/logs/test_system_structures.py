@@ -329,6 +329,9 @@ def test_values_that_a_system_refuses_beyond_a_bound_are_not_tried(arm):
     fit = fit_nominal(bases(log)[0].model, None, log, 5)
     assert fit.model.theta[0] == pytest.approx(0.95, abs=1e-3)
     assert (fit.standard_errors > 1e-4).all()  # tiny ones of derivatives across it
+    for length in (0.96, 0.4, np.nan):
+        with pytest.raises(SettingError, match="theta0: must lie between"):
+            fit_nominal(fit.model, np.array([length, 1.0]), log, 5)
 
 
 def test_columns_in_another_order_are_found_by_their_names(arm):
