@@ -2,8 +2,8 @@
 
     main -> _main (words to a command) -> _commands (the list) -> _NAME (the command)
 
-What stands here is there before any library: Ctrl-C ends the command with one line from
-its first moment on.
+What stands here is there before any library: Ctrl-C, or the signal by which systems end
+a process (SIGTERM), ends the command with one line from its first moment on.
 """
 
 import signal
@@ -23,40 +23,49 @@ def main() -> None:
 
             command()
     except BaseException as error:  # whatever a library made of the interrupt
-        if not interrupts.came:
+        if interrupts.number is None:
             raise
         has_advice = isinstance(error, KeyboardInterrupt) and error.args
         advice = f"; {error}" if has_advice else ""
         with suppress(OSError):
-            print(f"\ninterrupted{advice}", file=sys.stderr)
-        sys.exit(130)
+            print(f"\n{_WORDS[interrupts.number]}{advice}", file=sys.stderr)
+        sys.exit(128 + interrupts.number)
     finally:
         interrupts.end_at_once()
 
 
+# Signals that end a command, and what it says then.
+_WORDS: dict[int, str] = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated"}
+
+
 class _Interrupts:
-    """Makes every Ctrl-C a ``KeyboardInterrupt``; under nohup it stays ignored."""
+    """Makes every signal that ends a command a ``KeyboardInterrupt``.
+
+    What is ignored stays so, such as Ctrl-C under nohup.
+    """
 
     def __init__(self) -> None:
-        #: whether there was one
-        self.came = False
-        self._ignored = (
-            signal.getsignal(signal.SIGINT) is not signal.default_int_handler
-        )
-        if self._ignored:
-            return
-        signal.signal(signal.SIGINT, self._raise)
-        if hasattr(signal, "setitimer"):  # not on Windows
+        #: the first one that came
+        self.number: int | None = None
+        self._numbers = [
+            number
+            for number in _WORDS
+            if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
+        ]
+        for number in self._numbers:
+            signal.signal(number, self._raise)
+        if self._numbers and hasattr(signal, "setitimer"):  # not on Windows
             signal.signal(signal.SIGALRM, self._raise)
             sys.unraisablehook = self._raise_again
 
     def end_at_once(self) -> None:
         """Lets the next one end what is still being tidied up, without a traceback."""
-        if not self._ignored:
-            signal.signal(signal.SIGINT, signal.SIG_DFL)
+        for number in self._numbers:
+            signal.signal(number, signal.SIG_DFL)
 
     def _raise(self, number: int, frame: FrameType | None) -> None:
-        self.came = True
+        if self.number is None and number in _WORDS:
+            self.number = number
         raise KeyboardInterrupt
 
     def _raise_again(self, lost: "sys.UnraisableHookArgs") -> None:
