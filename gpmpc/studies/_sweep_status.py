@@ -149,7 +149,7 @@ class SweepWatch:
             counts=counts,
             failures={examples[kind]: n for kind, n in failures.most_common()},
             rate=rate,
-            active=counts[RunState.RUNNING] > 0 or time.time() - last_end < _STILL,
+            active=counts[RunState.RUNNING] > 0 or abs(time.time() - last_end) < _STILL,
         )
 
     def _runs(self, folder: str) -> Iterator[tuple[str, RunState, int | None]]:
@@ -232,10 +232,13 @@ def _written_at(path: str) -> int | None:
 
 
 def _rate(ends: list[float]) -> tuple[float | None, float]:
-    """Returns how many runs end in a second now, and when the last one did [s]."""
-    now = time.time()
-    late = sorted(end for end in ends if now - end < _RATE_WINDOW)
+    """Returns how many runs end in a second now, and when the last one did [s].
+
+    A node's clock may go before this machine's.
+    """
     last_end = max(ends, default=0.0)
+    now = max(time.time(), last_end)
+    late = sorted(end for end in ends if now - end < _RATE_WINDOW)
     if len(late) < 2 or now <= late[0]:
         return None, last_end
     return (len(late) - 1) / (now - late[0]), last_end

@@ -75,9 +75,10 @@ def test_each_look_sees_what_has_changed(tree):
     assert status.active
 
 
-def test_nobody_works_on_a_sweep_that_was_stopped(tmp_path):
+@pytest.mark.parametrize("ago", [300, -7200], ids=["then", "by a clock ahead"])
+def test_nobody_works_on_a_sweep_that_was_stopped(ago, tmp_path):
     plan(tmp_path, [["seed=0"], ["seed=1"]])
-    run(tmp_path, "seed=0", "metrics.json", ended=time.time() - 300)
+    run(tmp_path, "seed=0", "metrics.json", ended=time.time() - ago)
     status = SweepWatch(tmp_path).look()
     assert not status.active
     assert status.seconds_left is None
