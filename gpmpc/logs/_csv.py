@@ -25,6 +25,7 @@ from gpmpc.logs._file import (
     run_name,
 )
 from gpmpc.logs._findings import Finding
+from gpmpc.logs._list_cells import unpack_lists
 
 LONGEST_LINE = 2**20  # of a text file [bytes]
 _DELIMITERS = [mark.encode() for mark in DELIMITERS]
@@ -46,7 +47,8 @@ def read_csv(path: Path, options: ReadOptions) -> LogFile:
             warnings.simplefilter("error", pd.errors.ParserWarning)
             table = _read_in_parts(csv, budget)
     table.columns = _column_names(csv)
-    return LogFile({"": _without_empty_end(table)}, tuple(_findings(path, csv)))
+    table = unpack_lists(path, _without_empty_end(table), budget)
+    return LogFile({"": table}, tuple(_findings(path, csv)))
 
 
 def _column_names(csv: CsvText) -> list[str]:

@@ -113,3 +113,23 @@ def test_only_text_is_unpacked(tmp_path):
     packed.write_bytes(gzip.compress(b"an archive"))
     with pytest.raises(DataError, match="log.npz.gz: unknown kind of file; .* .tsv.gz"):
         read_log(packed, MAPPING)
+
+
+@pytest.mark.parametrize("write", [str, lambda v: str(np.array(v)), tuple])
+def test_lists_in_cells_are_columns_of_their_numbers(tmp_path, write):
+    values = [[0.5 * i, -1.0 + i, 2e-7] for i in range(200)]
+    table = TABLE.head(200).assign(p=[str(write(v)) for v in values], R="[[1, 0]]")
+    table.loc[7, "p"] = None
+    read = parse(tmp_path, table.to_csv(index=False))
+    assert list(read.columns) == ["t", "x", "u", "p[0]", "p[1]", "p[2]", "R"]
+    np.testing.assert_array_equal(
+        read["p[1]"].drop(7), np.delete(values, 7, axis=0)[:, 1]
+    )
+    assert np.isnan(read["p[2]"][7])
+
+
+@pytest.mark.parametrize("odd", ["[1, 2]", "[1, two, 3]", "broken", "[]"])
+def test_lists_of_several_lengths_stay_texts(tmp_path, odd):
+    table = TABLE.head(100).assign(p="[1, 2, 3]")
+    table.loc[60, "p"] = odd
+    assert list(parse(tmp_path, table.to_csv(index=False)).columns) == [*"txu", "p"]
