@@ -19,6 +19,7 @@ from scipy.optimize import nnls
 from gpmpc._dynamics import Array
 from gpmpc.logs._fitting import PAST
 from gpmpc.logs._log import Log
+from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._log_dynamics import TIME_CONSTANTS, OutputNoise
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._windows import Windows
@@ -29,6 +30,7 @@ _LINEARIZED = 200  # of a fold, along which rollouts are linearised: these are s
 _LINEARIZED_WITH_MEMORY = 60  # likewise of models with many entries to carry on
 _STRIDE_WITH_MEMORY = 8  # of the windows that are linearised of these
 _DIFFERENCE = 1e-6
+_NOTHING = 1e-300  # least variance that anything is divided by
 # Both are multiples of the time T of the longest prediction.
 _FORGETTING = 6.0  # time constant with which the weight of an earlier error decays
 _PRIOR = 1.0  # weight of the claim itself, as an error that is as large as claimed
@@ -49,7 +51,8 @@ def error_variances(
     stride = 1 if model.memory.empty else _STRIDE_WITH_MEMORY
     # Neighbours respond alike.
     responses = _responses(model, windows[::stride], steps)
-    return np.repeat(responses @ variances, stride, axis=0)[: len(windows)]
+    explained = responses @ variances * noise.scales_at(steps)
+    return np.repeat(explained, stride, axis=0)[: len(windows)]
 
 
 def follow_errors(
@@ -60,9 +63,10 @@ def follow_errors(
     A run may be calmer or rougher than those that the noise was fitted to. For each
     entry of the state and each step the scale is the mean of squared errors over
     claimed variances of the predictions that were over before, weighted by exp(-age /
-    (6 T)), with a one of the weight T added, and T the time of the longest prediction
-    (adaptive conformal inference by variances instead of quantiles; Gibbs and Candes,
-    2021).
+    (6 T)) and by the claimed deviations, with a one of the weight T added, and T the
+    time of the longest prediction (adaptive conformal inference by variances instead of
+    quantiles; Gibbs and Candes, 2021). Without the deviations, moments where little was
+    claimed would decide; with the variances, only those where much was.
 
     Args:
         windows: W of them.
@@ -85,10 +89,9 @@ def follow_errors(
             age = times[:, None] - times - (step - 0.5) * windows.time_step
             decay = np.exp(-np.maximum(age, 0) / (_FORGETTING * longest))
             weights = np.where(age > 0, spacing * decay, 0.0)
-            claimed = np.maximum(variances[rows, k], 1e-300)
-            ratios = errors[rows, k] ** 2 / claimed
-            total = prior + weights.sum(axis=1, keepdims=True)
-            scaled[rows, k] *= (prior + weights @ ratios) / total
+            deviations = np.sqrt(np.maximum(variances[rows, k], _NOTHING))
+            actual = prior * deviations + weights @ (errors[rows, k] ** 2 / deviations)
+            scaled[rows, k] *= actual / (prior * deviations + weights @ deviations)
     return scaled
 
 
@@ -106,7 +109,9 @@ def fit_noise(
     """Fits the noise that explains the errors of rollouts on held-out runs.
 
     Where these do not tell the outputs of a group apart, as x from y while the heading
-    turns, the outputs share as the squares of their residuals one step ahead do.
+    turns, the outputs share as the squares of their residuals one step ahead do. What
+    the sources leave unexplained, or explain twice, becomes a scale of the variances of
+    each group of states and step.
 
     Args:
         models: One for each fold.
@@ -132,7 +137,21 @@ def fit_noise(
     return OutputNoise(
         outputs=variances[:output_sources].reshape(len(TIME_CONSTANTS), -1),
         measurement=variances[output_sources:],
+        steps=tuple(steps),
+        scales=_scales(models[0].kinematics, squared, responses @ variances),
     )
+
+
+def _scales(kinematics: Kinematics, squared: Array, explained: Array) -> Array:
+    """Computes squared errors over explained variances (steps, e), by group."""
+    scales = np.ones_like(squared)
+    for columns in kinematics.space.error_columns:
+        actual = squared[:, columns].sum(axis=1, keepdims=True)
+        claimed = explained[:, columns].sum(axis=1, keepdims=True)
+        scales[:, columns] = np.where(
+            np.minimum(actual, claimed) > 0, actual / np.maximum(claimed, _NOTHING), 1.0
+        )
+    return scales
 
 
 def _fold_errors(

@@ -4,7 +4,10 @@ Several are fitted, between the rollout as it is and a ridge regression that kno
 model, and averaged. Which of them are is chosen on whole runs, for each group of states
 and step: each run, or block of one, is corrected by what the others say. The best one
 comes first, then, one by one, that with which the mean is best (Caruana et al., 2004,
-Ensemble selection from libraries of models).
+Ensemble selection from libraries of models). Each run counts alike, by its errors over
+those of the ridge regression there: the runs to come may be like any of them. What is
+chosen on a few runs is chosen by chance as well, so that up to a half of the average is
+the ridge regression where that costs next to nothing.
 """
 
 from collections.abc import Sequence
@@ -14,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpmpc._dynamics import Array
-from gpmpc.models._correction import Correction, Prior
+from gpmpc.models._correction import PENALTY, Correction, Prior
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._windows import Windows
 
@@ -25,8 +28,11 @@ _PRIORS = tuple(
     for penalty in (np.inf, 10.0, 1.0, 0.1, 0.01, 0.001)
     for movement in (1.0, 0.5, 0.0)
 )
+_RIDGE = _PRIORS.index(Prior(PENALTY, 0.0))  # the ridge regression without a model
 _NOTHING = 1e-300  # an error that is added, so that ratios of exact rollouts are one
 _MEMBERS = 8  # of an average, at most; one may be in it several times
+_RIDGE_SHARES = (0.5, 0.375, 0.25, 0.125)  # of an average, the first that costs little
+_COST = 0.02  # of the error, that such a share may add
 
 
 @dataclass(frozen=True)
@@ -90,17 +96,18 @@ def choose_averages(
         judged_steps: Whose errors decide.
     """
     errors = _errors_on_other_runs(kinematics, rollouts, judged_steps)
+    runs = rollouts.windows.runs
     columns_by_group = rollouts.windows.space.error_columns
     shares = np.empty((len(_PRIORS), len(judged_steps), len(columns_by_group)))
     ratios = np.empty(shares.shape[1:])
     for k in range(len(judged_steps)):
         for g, columns in enumerate(columns_by_group):
             own = errors[:, :, k, columns]
-            shares[:, k, g] = _choose_shares(own)
-            averaged = np.einsum("a,awe->we", shares[:, k, g], own)
+            shares[:, k, g] = _choose_shares(own, runs)
+            averaged = np.linalg.norm(_average(shares[:, k, g], own), axis=-1)
             # The first prior leaves the rollouts as they are.
-            without = _mean_length(own[0]) + _NOTHING
-            ratios[k, g] = (_mean_length(averaged) + _NOTHING) / without
+            without = np.linalg.norm(own[0], axis=-1)
+            ratios[k, g] = (averaged.mean() + _NOTHING) / (without.mean() + _NOTHING)
     return Averages(shares, ratios)
 
 
@@ -127,25 +134,62 @@ def _errors_on_other_runs(
     return errors
 
 
-def _choose_shares(errors: Array) -> Array:
-    """Chooses the shares (A,) whose average of errors (A, W, e) is shortest."""
+def _choose_shares(errors: Array, runs: np.ndarray) -> Array:
+    """Chooses the shares (A,) of an average of errors (A, W, e).
+
+    Args:
+        errors: Of each correction, on runs that it was not fitted to.
+        runs: Number of the run of each window (W,).
+    """
+    weights = _weights_by_run(np.linalg.norm(errors[_RIDGE], axis=-1), runs)
     counts = np.zeros(len(errors))
     total = np.zeros(errors.shape[1:])
     least = np.inf
     for members in range(1, _MEMBERS + 1):
-        lengths = _mean_length((total + errors) / members)
-        best = lengths.argmin()
-        if lengths[best] >= least:
+        scores = np.linalg.norm((total + errors) / members, axis=-1) @ weights
+        best = scores.argmin()
+        if scores[best] >= least:
             break
-        least = lengths[best]
+        least = scores[best]
         counts[best] += 1
         total = total + errors[best]
-    return counts / counts.sum()
+    shares = counts / counts.sum()
+    return _with_ridge(shares, errors, weights)
 
 
-def _mean_length(errors: Array) -> Array:
-    """Computes the mean length (...) of errors (..., W, e)."""
-    return np.linalg.norm(errors, axis=-1).mean(axis=-1)
+def _with_ridge(shares: Array, errors: Array, weights: Array) -> Array:
+    """Gives the ridge regression the largest share (A,) that costs next to nothing.
+
+    Args:
+        shares: Of the corrections (A,).
+        errors: Of each (A, W, e).
+        weights: Of the windows (W,).
+    """
+    most = (1 + _COST) * np.linalg.norm(_average(shares, errors), axis=-1) @ weights
+    for share in _RIDGE_SHARES:
+        mixed = (1 - share) * shares
+        mixed[_RIDGE] += share
+        if np.linalg.norm(_average(mixed, errors), axis=-1) @ weights <= most:
+            return mixed
+    return shares
+
+
+def _average(shares: Array, errors: Array) -> Array:
+    """Averages errors (A, W, e) with shares (A,)."""
+    return np.einsum("a,awe->we", shares, errors)
+
+
+def _weights_by_run(reference: Array, runs: np.ndarray) -> Array:
+    """Returns weights (W,) with which each run counts alike.
+
+    Args:
+        reference: Errors of the windows (W,), over whose mean in a run those of the run
+            are taken.
+        runs: Number of the run of each window (W,).
+    """
+    numbers = np.unique(runs, return_inverse=True)[1]
+    total = np.bincount(numbers, reference)
+    return 1 / (len(total) * np.maximum(total, _NOTHING))[numbers]
 
 
 def fit_correction(

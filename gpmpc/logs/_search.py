@@ -436,7 +436,7 @@ class Search:
         A structure has none whose rollouts diverge on all that a model was not fitted
         to.
         """
-        key = f"correction of {structure.key}"
+        key = f"averages of {structure.key}"
         if key not in self._memory:
             parts = [one.rollouts for one in self._validate(structure)]
             if not all(len(rollouts.windows) for rollouts in parts):

@@ -7,13 +7,15 @@ A rollout begins at a measured row, with its noise, unless a filter estimates th
 from the rows before it; and it knows nothing of what an actuator or an estimator still
 holds of earlier rows. What of its errors is linear in
 the past is found by a regression for each step, straight from the past to the error
-that far ahead. The movement that was rolled out is among the regressors, so that it can
-be shrunk or left out. Upon a state that does not move this is the ordinary ridge
+that far ahead. The movement that was rolled out is among the regressors, so that a
+share of it can be left out. Upon a state that does not move this is the ordinary ridge
 regression.
 
 A penalty pulls the coefficients to those of a prior: the rollout as it is, a share of
-its movement, or none of it, which is the start. Corrections with different priors and
-penalties predict best together: their coefficients are averaged.
+its movement, or none of it, which is the start. The coefficients of the movement are
+those of the prior: as good as the movement is on some runs, on faster ones it may be
+worse, and what is fitted to it is no longer the ridge regression. Corrections with
+different priors and penalties predict best together: their coefficients are averaged.
 """
 
 from collections.abc import Sequence
@@ -179,15 +181,20 @@ def _moments(
 
 
 def _weights(moments: _Moments, prior: Prior) -> Array:
-    """Computes the weights (1 + r, e) with a prior."""
-    expected = _expected_weights(moments, prior.movement)
+    """Computes the weights (1 + r, e) with a prior.
+
+    Those of the movement, which are the last ones, are not fitted.
+    """
+    weights = _expected_weights(moments, prior.movement)
     if np.isinf(prior.penalty):
-        return expected
+        return weights
+    fitted = slice(0, len(weights) - weights.shape[1])
     is_penalized = np.diag(np.r_[0.0, np.ones(len(moments.mean))])
     penalized = moments.normal + prior.penalty * moments.rows * is_penalized
-    missed = moments.with_errors - moments.normal @ expected
-    solution: Any = np.linalg.solve(penalized, missed)
-    return expected + solution
+    missed = moments.with_errors - moments.normal @ weights
+    solution: Any = np.linalg.solve(penalized[fitted, fitted], missed[fitted])
+    weights[fitted] += solution
+    return weights
 
 
 def _expected_weights(moments: _Moments, movement: float) -> Array:

@@ -9,7 +9,7 @@ controller's own estimate.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -39,6 +39,25 @@ class OutputNoise:
     #: of each of ``TIME_CONSTANTS`` and output (T, o), in squared units of the outputs
     outputs: Array
     measurement: Array  #: of each entry of a difference of states (e,), likewise
+    #: steps ahead at which ``scales`` stand (S,), increasing; none without
+    steps: tuple[int, ...] = ()
+    #: squared errors of held-out predictions over what the sources explain (S, e)
+    scales: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+    def scales_at(self, steps: Sequence[int]) -> Array:
+        """Returns factors (steps, e) of the variances that the sources explain.
+
+        They are interpolated over the logarithm of the step, and one without
+        ``scales``.
+        """
+        if not self.steps:
+            return np.ones((len(steps), len(self.measurement)))
+        logarithms = np.log(self.scales)
+        columns = [
+            np.interp(np.log(steps), np.log(self.steps), column)
+            for column in logarithms.T
+        ]
+        return np.exp(np.stack(columns, axis=-1))
 
 
 @dataclass(frozen=True, eq=False)

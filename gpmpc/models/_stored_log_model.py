@@ -10,7 +10,7 @@ of the identification.
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -84,6 +84,8 @@ def log_model_parts(
         "noise/outputs": torch.from_numpy(named.noise.outputs),
         "noise/measurement": torch.from_numpy(named.noise.measurement),
     }
+    if named.noise.steps:
+        tensors["noise/scales"] = torch.from_numpy(named.noise.scales)
     gps = []
     for i, gp in enumerate(model.gps):
         gp_header, gp_tensors = posterior_parts(path, gp.posterior)
@@ -97,6 +99,7 @@ def log_model_parts(
         "nominal": _nominal_header(model.nominal),
         "history": model.history,
         "lag": model.lag,
+        "noise_steps": named.noise.steps,
         "gps": gps,
         "names": [named.state_names, named.input_names, named.context_names],
         "time_step": named.time_step,
@@ -211,6 +214,12 @@ def log_model_of_parts(
         outputs=tensors["noise/outputs"].numpy(),
         measurement=tensors["noise/measurement"].numpy(),
     )
+    if header.get("noise_steps"):  # older files have none
+        noise = replace(
+            noise,
+            steps=tuple(header["noise_steps"]),
+            scales=tensors["noise/scales"].numpy(),
+        )
     _check_noise(noise, kinematics)
     named = NamedLogModel(
         model=model,
@@ -589,6 +598,21 @@ def _check_noise(noise: OutputNoise, kinematics: Kinematics) -> None:
     check_shape("noise/measurement", noise.measurement, (kinematics.space.error_dim,))
     if not all(np.isfinite(a).all() for a in (noise.outputs, noise.measurement)):
         raise DataError("noise must be finite")
+    if not noise.steps:
+        return
+    _check_noise_steps(noise.steps)
+    shape = len(noise.steps), kinematics.space.error_dim
+    check_shape("noise/scales", noise.scales, shape)
+    if not (np.isfinite(noise.scales) & (noise.scales > 0)).all():
+        raise DataError("noise/scales must be finite and positive")
+
+
+def _check_noise_steps(steps: Sequence[int]) -> None:
+    """Raises ``DataError`` unless steps are numbers of steps that increase."""
+    for step in steps:
+        check_number("noise_steps", step, least=1, whole=True)
+    if list(steps) != sorted(set(steps)):
+        raise DataError("noise_steps must increase")
 
 
 def check_shape(key: str, array: Array, shape: tuple[int, ...]) -> None:

@@ -122,6 +122,8 @@ def learned(kinematics, nominal, inputs, parameters, features):
         noise=OutputNoise(
             np.full((len(TIME_CONSTANTS), outputs), 0.1),
             np.full(space.error_dim, 0.01),
+            (1, 10),
+            np.full((2, space.error_dim), 1.1),
         ),
         fit=NominalFit(model, np.full(parameters, 0.2)),
         candidates=(Candidate("one", np.ones((2, 2)), True),),
