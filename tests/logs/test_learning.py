@@ -217,9 +217,9 @@ def test_a_rate_is_averaged_over_more_than_half_a_turn():
 
 
 def test_a_model_that_loses_to_a_baseline_is_called_so():
-    log = pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1])
+    log = pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1], rows=500)
     train, held_out = log.split(["run 2"])
-    learned = learn(train, points=60, steps=20)
+    learned = learn(train, points=40, steps=20)
     assert not judge(learned, held_out, train, steps=(1, 10)).losses
     for steps in ((10, 1), (1, 1)):
         with pytest.raises(SettingError, match="steps: must increase"):
@@ -234,7 +234,7 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
 
 
 def test_a_model_is_the_same_after_saving_and_damage_is_named(tmp_path):
-    log = pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1])
+    log = pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1], rows=500)
     memory = {}
     learned = learn(log, points=40, steps=20, memory=memory)
     assert learned.model.gps
