@@ -47,7 +47,7 @@ class Reference:
 
     Raises:
         ShapeError: States, inputs and kappas do not belong together.
-        SettingError: A kappa is negative or no number.
+        SettingError: A kappa is negative.
 
     >>> import numpy as np
     >>> Reference(np.zeros((11, 2)), inputs=np.zeros((10, 1))).states.shape
@@ -95,7 +95,7 @@ class Reference:
             raise ShapeError(f"reference inputs must be ({H}, m); got {inputs_shape}")
         if self.kappas is not None and np.shape(self.kappas) != (H,):
             raise ShapeError(f"kappas must be ({H},); got {np.shape(self.kappas)}")
-        if self.kappas is not None and not (np.asarray(self.kappas) >= 0).all():
+        if self.kappas is not None and (np.asarray(self.kappas) < 0).any():
             raise SettingError("kappas", f"must not be negative; got {self.kappas}")
 
     def _read_names(self) -> None:

@@ -106,6 +106,11 @@ def test_an_adaptive_tube_holds_where_noise_exceeds_the_model():
             r"kappas must be \(6,\); got \(7,\)",
         ),
         (
+            lambda: replace(FAR, kappas=np.full(H, -1.0)),
+            SettingError,
+            "kappas: must not be negative",
+        ),
+        (
             lambda: controller().control(
                 START, replace(FAR, kappas=np.full(H, np.nan))
             ),

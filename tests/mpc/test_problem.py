@@ -170,3 +170,7 @@ def test_a_weight_may_be_skew_by_round_off_and_no_more(skew):
         else:
             with pytest.raises(SettingError, match="Q: must be symmetric"):
                 Tracking(weight, [1.0])
+
+
+def test_stages_may_be_an_array():
+    assert Box([-1.0], [1.0], stages=np.arange(2, 5)).stages == (2, 3, 4)
