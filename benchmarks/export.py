@@ -1,7 +1,7 @@
 """Holds exported controllers to the decisions of Python, question by question.
 
     .venv/bin/python -m benchmarks.export [--questions 20000] [--cases quadrotor-10 ..]
-                                          [--precisions double float]
+                                          [--precisions double float] [--sanitize]
 
 Six controllers fly in closed loops of Python: the quadrotor of the paper with a
 horizon of 10 and of 20 (chance constraints of its position), a learned cart-pole that
@@ -10,6 +10,10 @@ the learned pole whose input acts three steps late, and the stirred tank. Every 
 of these flights (belief, reference, last decision) goes to the compiled C as well, in
 double and in float. Every flight has a seed, of its noise and of what disturbs its
 start, its reference or its wind.
+With ``--sanitize`` every question goes to a build with clang's sanitizers of addresses
+and undefined behaviour as well, which end the process at a fault; start it with
+``LD_PRELOAD=$(clang -print-file-name=libclang_rt.asan-x86_64.so) ASAN_OPTIONS=
+detect_leaks=0``.
 Printed for each: questions, the largest difference of an input, as a share of the
 input's range in brackets, other statuses, and the median time of a step of Python and
 of C alone [ms]. Writes ``outputs/benchmarks/export.json``.
@@ -47,6 +51,14 @@ from gpmpc.trajectories import states_along
 Array = np.ndarray
 # of a flight, after which the next seed flies
 STEPS = 250
+SANITIZED = (
+    "clang",
+    "-O1",
+    "-g",
+    "-fsanitize=address,undefined",
+    "-fno-sanitize-recover=all",
+    "-shared-libasan",
+)
 
 
 class Case(NamedTuple):
@@ -67,7 +79,9 @@ class Comparison:
         answers: Of the compiled ones, by precision.
     """
 
-    def __init__(self, controller: GPMPC, precisions: Sequence[Any]):
+    def __init__(
+        self, controller: GPMPC, precisions: Sequence[Any], sanitize: bool = False
+    ):
         self.horizon = controller.horizon
         self.problem = controller.problem
         self.initial_input = controller.initial_input
@@ -79,6 +93,11 @@ class Comparison:
             precision: CompiledAnswers(CompiledController(controller, precision))
             for precision in precisions
         }
+        self._sanitized = [
+            CompiledController(controller, precision, compiler=SANITIZED)
+            for precision in precisions
+            if sanitize
+        ]
 
     @property
     def signals(self):
@@ -94,6 +113,8 @@ class Comparison:
         self.inputs.append(decision.input)
         for answers in self.answers.values():
             answers.compare(decision, belief, reference, previous)
+        for compiled in self._sanitized:
+            compiled.control(belief, reference, previous)
         return decision
 
 
@@ -350,10 +371,14 @@ CASES: dict[str, Callable[[], Case]] = {
 
 
 def compare(
-    name: str, case: Case, questions: int, precisions: Sequence[Any]
+    name: str,
+    case: Case,
+    questions: int,
+    precisions: Sequence[Any],
+    sanitize: bool = False,
 ) -> list[dict[str, Any]]:
     """Asks all of them a number of questions; returns a row for each precision."""
-    comparison = Comparison(case.controller, precisions)
+    comparison = Comparison(case.controller, precisions, sanitize)
     seed = 0
     while len(comparison.inputs) < questions:
         case.fly(comparison, seed)
@@ -388,11 +413,18 @@ def main() -> None:
     parser.add_argument("--questions", type=int, default=20_000)
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument("--precisions", nargs="+", default=["double", "float"])
+    parser.add_argument("--sanitize", action="store_true")
     arguments = parser.parse_args()
     use_one_thread()
     table = []
     for name in arguments.cases:
-        rows = compare(name, CASES[name](), arguments.questions, arguments.precisions)
+        rows = compare(
+            name,
+            CASES[name](),
+            arguments.questions,
+            arguments.precisions,
+            arguments.sanitize,
+        )
         table += rows
         for row in rows:
             print(

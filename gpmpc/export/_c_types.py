@@ -32,6 +32,8 @@ def fields_type(
             ("label", ctypes.c_int * constraints),
             ("multiplier", number * constraints),
             ("x", number * (H * m)),
+            ("x_low", number * (H * m)),
+            ("violation", number),
         )
 
     belief = (("mean", number * n), ("covariance", (number * n) * n))

@@ -12,6 +12,10 @@ _LOG2_E = 1.0 / np.log(2.0)
 # bits of a sum of squares that are left for u: beyond, whole numbers do not reach
 _LEAST_BITS = 9
 _MOST_BITS = 60
+# Rounding of a mean and of a slope, as shares of the means' range over the points, and
+# of that over the range of a feature. Beyond, an input may miss 1e-4 of its range.
+_MEAN_ERROR = 1e-4
+_SLOPE_ERROR = 1e-3
 
 
 class FixedPoint(NamedTuple):
@@ -28,7 +32,7 @@ class FixedPoint(NamedTuple):
 
 
 def fixed_point(gp: GPPosterior) -> FixedPoint | None:
-    """Returns GPs in whole numbers; None where these do not reach."""
+    """Returns GPs in whole numbers; None where these are not exact enough."""
     x = to_array(gp.features)
     lengthscales = to_array(gp.lengthscales)
     beta = to_array(gp.weights)
@@ -41,6 +45,8 @@ def fixed_point(gp: GPPosterior) -> FixedPoint | None:
     bits = np.floor(np.log2((2.0**32 - 1) / squares.sum(axis=1)))
     bits = np.minimum(bits, _MOST_BITS).astype(int)
     if (bits < _LEAST_BITS).any():
+        return None
+    if not _is_exact_enough(gp, reach):
         return None
     total = np.maximum(np.abs(beta).sum(axis=1), np.finfo(float).tiny)
     weight_unit = (2.0**31 - 1 - 2 * size) / total
@@ -56,6 +62,32 @@ def fixed_point(gp: GPPosterior) -> FixedPoint | None:
         remainders=np.floor((scaled - weights) * (2.0**32 - 1)),
         weight_unit=weight_unit,
     )
+
+
+def _is_exact_enough(gp: GPPosterior, reach: Array) -> bool:
+    """Returns whether whole numbers round means and slopes finely enough.
+
+    Terms that cancel to a millionth of them magnify what each rounds off: a square of
+    31 bits, and for slopes a product beta k of which all have 31 bits.
+    """
+    x = to_array(gp.features)
+    lengthscales = to_array(gp.lengthscales)
+    weights = to_array(gp.weights) * to_array(gp.signal_variance)[:, None]
+    feature_range = np.ptp(x, axis=0)
+    for scales, beta in zip(lengthscales, weights, strict=True):
+        z = x / scales
+        squares = ((z[:, None] - z[None]) ** 2).sum(axis=2)
+        kernel = np.exp(-squares / 2)
+        output_range = max(np.ptp(kernel @ beta), np.finfo(float).tiny)
+        exponent = 2.0**-31 * ((reach / scales) ** 2).sum() / 2
+        mean_error = exponent * np.sqrt((kernel**2 @ beta**2).max())
+        product_error = 2.0**-32 * np.sqrt(len(x)) * np.abs(beta).sum()
+        slope_error = product_error * (reach / scales**2 * feature_range).max()
+        if mean_error > _MEAN_ERROR * output_range:
+            return False
+        if slope_error > _SLOPE_ERROR * output_range:
+            return False
+    return True
 
 
 def fixed_tables(gp: GPPosterior, prefix: str) -> str:

@@ -14,8 +14,6 @@ Array = np.ndarray
 
 # The tolerance of a solver in float, the power of the rounding unit that 1e-9 is.
 _FLOAT_TOLERANCE = 1e-4
-# A price that is more than nearly every bound is worth, in the cost's largest weight.
-_EXACT_PRICE = 1e3
 
 
 _COMMENTS = {
@@ -34,7 +32,6 @@ _COMMENTS = {
     "GPMPC_GP_OUTPUTS": "k",
     "GPMPC_PENALIZED": "what R weighs: 0 inputs, 1 deviations, 2 increments",
     "GPMPC_TOLERANCE": "of a solution, as a share of its size",
-    "GPMPC_EXACT_PRICE": "to which larger ones sink where digits do not suffice",
     "GPMPC_DISTURBANCE_GAIN": "of the estimate of a constant error",
 }
 
@@ -91,7 +88,6 @@ def definitions(
     tolerance = float(getattr(solver, "tolerance", 1e-9))
     if numbers.precision == "float":
         tolerance = max(tolerance, _FLOAT_TOLERANCE)
-    exact = _EXACT_PRICE * _largest_weight(controller)
     angles = list(controller.problem.cost.angle_indices)
     values = {
         "GPMPC_STATES": str(prediction.state_dim),
@@ -107,7 +103,6 @@ def definitions(
         "GPMPC_COST_ANGLE_COUNT": str(len(angles)),
         "GPMPC_STATE_ANGLE_COUNT": str(len(prediction.angles)),
         "GPMPC_TOLERANCE": f"(gpmpc_real){tolerance!r}",
-        "GPMPC_EXACT_PRICE": f"(gpmpc_real){exact!r}",
         "GPMPC_DISTURBANCE_GAIN": f"(gpmpc_real){float(gain)!r}",
     }
     values |= {f"GPMPC_{name}": str(size) for name, size in model_sizes.items()}
@@ -186,10 +181,3 @@ def _optional_tables(controller: GPMPC, numbers: Numbers) -> list[str]:
         parts.append(numbers.table("row_kappas", kappas, "deviations to a side"))
         parts.append(numbers.table("process_noise", noise, note))
     return parts
-
-
-def _largest_weight(controller: GPMPC) -> float:
-    """Returns the largest eigenvalue of a weight."""
-    cost = controller.problem.cost
-    weights = (cost.Q, cost.terminal, cost.R)
-    return float(max(np.linalg.eigvalsh(weight).max() for weight in weights))

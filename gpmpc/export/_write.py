@@ -118,7 +118,9 @@ def _texts(
     ]
     parts = {
         "model": "\n".join(generated),
-        "qp": _part("qp.c"),
+        "pairs": _part("pairs.c"),
+        "exact": _part("exact.c"),
+        "qp": _part("qp.c").replace("/*{rescue}*/", _part("rescue.c")),
         "filter": _part("filter.c") if estimator is not None else "",
     }
     names = _names(controller, estimator)

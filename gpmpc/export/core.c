@@ -142,6 +142,8 @@ static int solve_positive(real *A, int size, real *X, int columns)
     return 1;
 }
 
+/*{pairs}*/
+
 /*{model}*/
 
 /* ------------------------------------------------------------------------------------
@@ -308,6 +310,28 @@ static void write_model_covariances(gpmpc_problem *problem, int first, int last)
 }
 #endif
 
+/* c <- after - A s - B u of entry i at stage k, where the plan leads from s to ``after``
+   by u; in float with what it rounds off: states are large beside what they change. */
+static void write_offset(gpmpc_problem *problem, int k, int i, real after,
+                         const real *s, const real *u)
+{
+    const real *A = problem->A[k][i];
+    const real *B = problem->B[k][i];
+#if GPMPC_IS_FLOAT
+    Pair offset = pair_of(after, 0);
+    int j;
+    for (j = 0; j < n; j++)
+        add_multiple(&offset, -A[j], pair_of(s[j], 0));
+    for (j = 0; j < m; j++)
+        add_multiple(&offset, -B[j], pair_of(u[j], 0));
+    offset = normalised(offset);
+    problem->c[k][i] = offset.high;
+    problem->c_low[k][i] = offset.low;
+#else
+    problem->c[k][i] = after - (dot(A, s, n) + dot(B, u, m));
+#endif
+}
+
 /* Linearises the dynamics along the plan: c = f(s, u) + d - A s - B u. */
 static void linearize(gpmpc_controller *controller)
 {
@@ -324,8 +348,7 @@ static void linearize(gpmpc_controller *controller)
         model(s, u, work, next, &problem->A[k][0][0], &problem->B[k][0][0]);
         for (i = 0; i < n; i++) {
             real after = next[i] + (GPMPC_ESTIMATES ? controller->disturbance[i] : 0);
-            problem->c[k][i] = after - (dot(problem->A[k][i], s, n)
-                                        + dot(problem->B[k][i], u, m));
+            write_offset(problem, k, i, after, s, u);
         }
 #if GPMPC_TUBES
         if (work->lane == GPMPC_LANES - 1 || k == GPMPC_STAGES - 1)
@@ -349,8 +372,8 @@ static void write_increments(gpmpc_controller *controller)
         last[i] += whole_turns(problem->states[0][i] - last[i]);
     }
     for (i = 0; i < n; i++)
-        problem->c[0][i] = problem->states[0][i] - dot(problem->A[0][i], last, n)
-                           - dot(problem->B[0][i], problem->previous_input, m);
+        write_offset(problem, 0, i, problem->states[0][i], last,
+                     problem->previous_input);
 }
 #endif
 
@@ -473,7 +496,8 @@ static void predict_covariances(gpmpc_problem *problem, const real *start)
 #if GPMPC_SMOOTH
 #define ROW_BY_STATE(problem, k, e) ((problem)->E[k][e])
 #else
-#define ROW_BY_STATE(problem, k, e) ((void)(k), row_gradients + (e) * n)
+#define ROW_BY_STATE(problem, k, e) \
+    ((void)(problem), (void)(k), row_gradients + (e) * n)
 #endif
 
 /* E s_{k+1} + D u_k */
@@ -712,6 +736,20 @@ static void add_states(gpmpc_problem *problem, gpmpc_program *program)
             program->P[j][i] = program->P[i][j];
 }
 
+/* Writes the bounds of constraint p less its value at v = 0; in float with what these
+   round off. */
+static void write_bound(gpmpc_program *program, int p, real low, real high, real value)
+{
+    Pair lower = pair_of(low, 0);
+    Pair upper = pair_of(high, 0);
+    add(&lower, -value);
+    add(&upper, -value);
+    program->lower[p] = lower.high;
+    program->upper[p] = upper.high;
+    program->lower_low[p] = GPMPC_IS_FLOAT && is_finite(low) ? lower.low : 0;
+    program->upper_low[p] = GPMPC_IS_FLOAT && is_finite(high) ? upper.low : 0;
+}
+
 /* Writes the bounds of inputs, increments and rows, of which inputs and states are
    those at v = 0; the first ``unbounded`` constraints have none. */
 static void write_bounds(const gpmpc_problem *problem, const real *inputs,
@@ -720,27 +758,24 @@ static void write_bounds(const gpmpc_problem *problem, const real *inputs,
     int k, i, e;
     int first_rate = unbounded + N;
     int first_row = first_rate + GPMPC_RATE_ROWS;
-    for (i = 0; i < unbounded; i++) {
-        program->lower[i] = -INFINITY;
-        program->upper[i] = INFINITY;
-    }
+    for (i = 0; i < unbounded; i++)
+        write_bound(program, i, -INFINITY, INFINITY, 0);
     for (k = 0; k < H; k++) {
         const real *u = inputs + k * m;
         for (i = 0; i < m; i++) {
-            program->lower[unbounded + k * m + i] = input_lower[k * m + i] - u[i];
-            program->upper[unbounded + k * m + i] = input_upper[k * m + i] - u[i];
+            write_bound(program, unbounded + k * m + i, input_lower[k * m + i],
+                        input_upper[k * m + i], u[i]);
             if (GPMPC_HAS_RATES) {
                 real last = k > 0 ? inputs[(k - 1) * m + i]
                                   : problem->previous_input[i];
-                real rate = u[i] - last;
-                program->lower[first_rate + k * m + i] = rate_lower[k * m + i] - rate;
-                program->upper[first_rate + k * m + i] = rate_upper[k * m + i] - rate;
+                write_bound(program, first_rate + k * m + i, rate_lower[k * m + i],
+                            rate_upper[k * m + i], u[i] - last);
             }
         }
         for (e = 0; e < r; e++) {
             real value = row_value(problem, k, e, states + (k + 1) * n, u);
-            program->lower[first_row + k * r + e] = problem->row_lower[k][e] - value;
-            program->upper[first_row + k * r + e] = problem->row_upper[k][e] - value;
+            write_bound(program, first_row + k * r + e, problem->row_lower[k][e],
+                        problem->row_upper[k][e], value);
         }
     }
 }
@@ -1029,6 +1064,8 @@ static void condense(gpmpc_controller *controller)
         condense_with_feedback(controller);
 }
 
+/*{exact}*/
+
 /*{qp}*/
 
 /* ------------------------------------------------------------------------------------
@@ -1074,28 +1111,49 @@ static real cost_of_plan(const gpmpc_problem *problem, const real *states,
     return total;
 }
 
-/* Returns the largest violation of an elastic row of a plan. */
-static real elastic_violation(const gpmpc_problem *problem, const real *states,
-                              const real *inputs)
+/* Writes by how much the plan of a solution misses its rows (H, r); negative inside. */
+static void write_misses(const gpmpc_problem *problem, const gpmpc_solution *solution,
+                         real *misses)
 {
-    real largest = 0;
     int k, e;
+#if GPMPC_IS_FLOAT
+    Rollout plan;
+    roll_out(problem, solution->x, solution->x_low, &plan);
     for (k = 0; k < H; k++)
         for (e = 0; e < r; e++) {
-            real miss = row_miss(problem, k, e, states + (k + 1) * n, inputs + k * m);
-            if (row_is_elastic[e])
-                largest = larger(largest, miss);
+            Pair value = exact_row(problem, &plan, k, e);
+            misses[k * r + e] =
+                larger((value.high - problem->row_upper[k][e]) + value.low,
+                       (problem->row_lower[k][e] - value.high) - value.low);
         }
-    return largest;
+#else
+    real inputs[GPMPC_SIZE];
+    real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
+    expand(problem, solution->x, inputs, states);
+    for (k = 0; k < H; k++)
+        for (e = 0; e < r; e++)
+            misses[k * r + e] =
+                row_miss(problem, k, e, states + (k + 1) * n, inputs + k * m);
+#endif
+}
+
+/* Whether all elastic rows are kept. */
+static int keeps_elastic_rows(const real *misses)
+{
+    int k, e;
+    for (k = 0; k < H; k++)
+        for (e = 0; e < r; e++)
+            if (row_is_elastic[e] && misses[k * r + e] > KEPT)
+                return 0;
+    return 1;
 }
 
 /* Returns the price of elastic rows that cannot be kept (gpmpc/mpc/_elastic.py):
    with cost J0 and violations V0 of the plan without them,
    price = 2 (J + ..) / V0,   J0 <= J <= 2 J0 */
-static real elastic_price(const gpmpc_problem *problem, const real *states,
-                          const real *inputs, real last_cost)
+static real elastic_price(const gpmpc_problem *problem, const real *misses,
+                          real free_cost, real last_cost)
 {
-    real free_cost = cost_of_plan(problem, states, inputs);
     real cost = smaller(larger(free_cost, last_cost), 2 * free_cost);
     real sum_of_misses = 0;
     real beside = 0;
@@ -1104,7 +1162,7 @@ static real elastic_price(const gpmpc_problem *problem, const real *states,
         for (e = 0; e < r; e++) {
             const real *g = ROW_BY_STATE(problem, k, e);
             const real *Q = running_weight(k);
-            real miss = row_miss(problem, k, e, states + (k + 1) * n, inputs + k * m);
+            real miss = misses[k * r + e];
             real weight = 0;
             real square;
             if (!row_is_elastic[e] || !(miss > 0))
@@ -1118,18 +1176,6 @@ static real elastic_price(const gpmpc_problem *problem, const real *states,
     return 2 * (cost + beside) / larger(sum_of_misses, REAL(1e-12));
 }
 
-/* Whether the solution was found, and keeps the elastic rows. */
-static int keeps_elastic_rows(const gpmpc_problem *problem,
-                              const gpmpc_solution *solution)
-{
-    real inputs[GPMPC_SIZE];
-    real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
-    if (solution->status != GPMPC_SOLVED)
-        return 0;
-    expand(problem, solution->x, inputs, states);
-    return elastic_violation(problem, states, inputs) <= KEPT;
-}
-
 /* Sets the price of the elastic rows. */
 static void set_elastic_price(gpmpc_problem *problem, real price)
 {
@@ -1139,81 +1185,30 @@ static void set_elastic_price(gpmpc_problem *problem, real price)
             problem->prices[e] = price;
 }
 
-/* Solves the program once more with another price of the elastic rows, where the first
-   solution misses one of them. Where the exact price took more digits than there are, a
-   thousandth of it may do: a row whose multiplier stays below is kept all the same. */
+/* Solves the program once more where its solution misses an elastic row, with a price
+   that cannot outweigh the cost. */
 static void lower_elastic_prices(gpmpc_controller *controller)
 {
     gpmpc_problem *problem = &controller->problem;
+    gpmpc_program *program = &controller->program;
     gpmpc_solution *solution = &controller->candidate;
-    gpmpc_solution *free_solution = &controller->elastic;
+    real misses[GPMPC_STATE_ROWS];
     real inputs[GPMPC_SIZE];
     real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
-    real last_cost, price;
-    int attempt;
-    if (keeps_elastic_rows(problem, solution))
+    real last_cost, free_cost;
+    if (solution->status != GPMPC_SOLVED)
         return;
-    if (solution->status != GPMPC_SOLVED) {
-        int e;
-        for (e = 0; e < r; e++)
-            if (row_is_elastic[e])
-                problem->prices[e] /= 1000;
-        solve(&controller->program, problem->prices, &controller->solution, solution);
-        if (keeps_elastic_rows(problem, solution))
-            return;
-    }
+    write_misses(problem, solution, misses);
+    if (keeps_elastic_rows(misses))
+        return;
     last_cost = cost_of_plan(problem, &problem->states[0][0], &problem->inputs[0][0]);
     set_elastic_price(problem, REAL(1e-9)); /* next to nothing: rows keep their place */
-    solve(&controller->program, problem->prices, solution, free_solution);
-    expand(problem, free_solution->x, inputs, states);
-    price = elastic_price(problem, states, inputs, last_cost);
-    for (attempt = 0; attempt < 4; attempt++) { /* a price may take too many digits */
-        const gpmpc_solution *start = attempt ? free_solution : solution;
-        set_elastic_price(problem, price);
-        solve(&controller->program, problem->prices, start, solution);
-        if (solution->status == GPMPC_SOLVED)
-            return;
-        price /= 30;
-    }
-}
-#endif
-
-#if GPMPC_SOFT
-/* Solves again where the exact prices took more digits than there are: a thousandth of
-   them still is more than a bound that can be kept is worth. */
-static void lower_exact_prices(gpmpc_controller *controller)
-{
-    gpmpc_problem *problem = &controller->problem;
-    gpmpc_solution *solution = &controller->candidate;
-    int lowered = 0;
-    int e;
-    if (solution->status != GPMPC_NUMERICAL_TROUBLE
-        && solution->status != GPMPC_ITERATION_LIMIT)
-        return;
-    for (e = 0; e < r; e++)
-        if (problem->prices[e] > GPMPC_EXACT_PRICE && problem->prices[e] < LARGEST) {
-            problem->prices[e] = GPMPC_EXACT_PRICE;
-            lowered = 1;
-        }
-    if (lowered)
-        solve(&controller->program, problem->prices, &controller->solution, solution);
-}
-#endif
-
-#if !GPMPC_ROLLS_OUT
-/* By how much a solution misses a bound of its program, at most: there a bound counts
-   from the plan that was linearised, and keeps the digits that a state far from zero
-   has not. */
-static real program_violation(const gpmpc_program *program, const real *x)
-{
-    real largest = 0;
-    int p;
-    for (p = 0; p < N + program->rows; p++) {
-        real value = p < N ? x[p] : dot(program->G[p - N], x, N);
-        largest = larger(largest, larger(value - program->upper[p],
-                                         program->lower[p] - value));
-    }
-    return largest;
+    solve(problem, program, solution, &controller->elastic);
+    expand(problem, controller->elastic.x, inputs, states);
+    free_cost = cost_of_plan(problem, states, inputs);
+    write_misses(problem, &controller->elastic, misses);
+    set_elastic_price(problem, elastic_price(problem, misses, free_cost, last_cost));
+    solve(problem, program, solution, solution);
 }
 #endif
 
@@ -1347,10 +1342,7 @@ static int decide(gpmpc_controller *controller, const real *state,
     if (!write_problem(controller, state, covariance, reference))
         return GPMPC_FUNCTION_NOT_FINITE;
     condense(controller);
-    solve(&controller->program, problem->prices, &controller->solution, solution);
-#if GPMPC_SOFT
-    lower_exact_prices(controller);
-#endif
+    solve(problem, &controller->program, &controller->solution, solution);
 #if GPMPC_ELASTIC
     lower_elastic_prices(controller);
 #endif
@@ -1368,7 +1360,7 @@ static int decide(gpmpc_controller *controller, const real *state,
 #if GPMPC_ROLLS_OUT
     controller->violation = largest_violation(problem);
 #else
-    controller->violation = program_violation(&controller->program, solution->x);
+    controller->violation = solution->violation;
 #endif
     if (status == GPMPC_SOLVED && controller->violation > KEPT)
         return GPMPC_SOFT_BOUND_MISSED;

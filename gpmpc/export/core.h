@@ -85,6 +85,8 @@ typedef struct {
     int label[GPMPC_CONSTRAINTS]; /* p + 1 at the upper bound, -(p + 1) at the lower */
     gpmpc_real multiplier[GPMPC_CONSTRAINTS];
     gpmpc_real x[GPMPC_SIZE];
+    gpmpc_real x_low[GPMPC_SIZE]; /* what x rounds off; zero in double */
+    gpmpc_real violation;         /* of a bound of the program, at most */
 } gpmpc_solution;
 
 /* The memory of the dual active set; see gpmpc/qp/_workspace.py. */
@@ -105,6 +107,11 @@ typedef struct {
     gpmpc_real multiplier[GPMPC_CONSTRAINTS];
     gpmpc_real value[GPMPC_CONSTRAINTS];
     gpmpc_real excess[GPMPC_CONSTRAINTS];
+    /* what these round off, where it is known; else zero */
+    gpmpc_real lower_low[GPMPC_CONSTRAINTS];
+    gpmpc_real upper_low[GPMPC_CONSTRAINTS];
+    gpmpc_real multiplier_low[GPMPC_CONSTRAINTS];
+    gpmpc_real value_low[GPMPC_CONSTRAINTS];
     int row_end[GPMPC_CONSTRAINTS];
     int violated[GPMPC_CONSTRAINTS];
     int candidates[GPMPC_CONSTRAINTS];
@@ -140,6 +147,9 @@ typedef struct {
     gpmpc_real A[GPMPC_STAGES][GPMPC_STATES][GPMPC_STATES];
     gpmpc_real B[GPMPC_STAGES][GPMPC_STATES][GPMPC_INPUTS];
     gpmpc_real c[GPMPC_STAGES][GPMPC_STATES];
+#if GPMPC_IS_FLOAT
+    gpmpc_real c_low[GPMPC_STAGES][GPMPC_STATES]; /* what c rounds off */
+#endif
 #if GPMPC_TUBES
     gpmpc_real V[GPMPC_STAGES][GPMPC_STATES][GPMPC_STATES];
     gpmpc_real covariances[GPMPC_HORIZON + 1][GPMPC_STATES][GPMPC_STATES];

@@ -13,6 +13,7 @@
 #define TANH tanhf
 #define POW powf
 #define FABS fabsf
+#define FMA fmaf
 #define ASIN asinf
 #define ACOS acosf
 #define SINH sinhf
@@ -32,12 +33,12 @@
 #define LARGEST FLT_MAX
 #define TINY REAL(1e-37)
 #define UNDEFINED REAL(1e37)
-#define TOLERATED REAL(9e-7)
+#define TOLERATED REAL(1e-7)
 #define NEGLIGIBLE REAL(3e-12)
 #define NOISE REAL(9e-7)
 #define LATER REAL(1.4e-5)
-#define FINE REAL(5e-5)
-#define FINEST REAL(2.3e-7)
+#define FINE REAL(1e-8)
+#define FINEST REAL(1e-10)
 #define DOUBT REAL(1.3e-3)
 #define ILL REAL(3.5e-2)
 #define DEPENDENT_SQUARE REAL(5e-6)
@@ -47,10 +48,15 @@
 #define ROUNDING_OF_SUMS REAL(2e-6)
 #define HOPELESS REAL(8e-4)
 #define NO_RATE REAL(5e-6)
+#define ROUNDING_OF_DATA REAL(5e-7)
+#define DEPENDENT_DISTANCES {REAL(5e-7), REAL(1.5e-6), REAL(4e-6), REAL(3e-5)}
+#define GUESS_MARGIN REAL(500.0)
+#define CONVERGED REAL(1e-9)
+#define UNNOTICED REAL(1e-8)
 #define ROW_RESIDUAL REAL(1e-4)
 #define PIVOT_ROUNDING REAL(1.2e-7)
 #define LARGEST_GROWTH REAL(300.0)
-#define KEPT REAL(1e-4) /* by how much a bound may be missed that counts as kept */
+#define KEPT REAL(1e-5) /* by how much a bound may be missed that counts as kept */
 #else
 #define REAL(number) number
 #define SQRT sqrt
@@ -64,6 +70,7 @@
 #define TANH tanh
 #define POW pow
 #define FABS fabs
+#define FMA fma
 #define ASIN asin
 #define ACOS acos
 #define SINH sinh
@@ -98,6 +105,11 @@
 #define ROUNDING_OF_SUMS REAL(4e-15)
 #define HOPELESS REAL(1e-7)
 #define NO_RATE REAL(1e-12)
+#define ROUNDING_OF_DATA REAL(1e-14)
+#define DEPENDENT_DISTANCES {REAL(1e-14), REAL(1e-13), REAL(1e-12), REAL(1e-10)}
+#define GUESS_MARGIN REAL(1e6)
+#define CONVERGED REAL(1e-12)
+#define UNNOTICED REAL(1e-16)
 #define ROW_RESIDUAL REAL(1e-9)
 #define PIVOT_ROUNDING REAL(2.3e-16)
 #define LARGEST_GROWTH REAL(3e7)

@@ -8,7 +8,7 @@
    The working set is a list of k slots, each with a row of the factor of K_WW.
    --------------------------------------------------------------------------------- */
 
-enum { BATCHES = 4, ROUNDS = 10, REFINEMENTS = 3 };
+enum { BATCHES = 4, ROUNDS = 10, REFINEMENTS = GPMPC_IS_FLOAT ? 6 : 3 };
 
 /* The largest number of changes of the working set. */
 static int iteration_limit(const gpmpc_program *work)
@@ -143,6 +143,7 @@ static int read_bounds(gpmpc_program *work)
         work->upper[p] = high;
         work->negligible[p] = work->negligible_length * work->norm[p];
         work->multiplier[p] = 0;
+        work->multiplier_low[p] = 0;
         restore_limits(work, p);
     }
     return 1;
@@ -165,6 +166,7 @@ static int is_watched(const gpmpc_program *work, int p)
 static void write_value(gpmpc_program *work, int row)
 {
     work->value[N + row] = dot(work->G[row], work->value, work->row_end[N + row]);
+    work->value_low[N + row] = 0;
 }
 
 static void multiply_constraints(gpmpc_program *work)
@@ -176,8 +178,11 @@ static void multiply_constraints(gpmpc_program *work)
 
 static real outside(const gpmpc_program *work, int p)
 {
-    return larger(work->value[p] - work->allowed_high[p],
-                  work->allowed_low[p] - work->value[p]);
+    real above = (work->value[p] - work->allowed_high[p])
+                 + (work->value_low[p] - work->upper_low[p]);
+    real below = (work->allowed_low[p] - work->value[p])
+                 + (work->lower_low[p] - work->value_low[p]);
+    return larger(above, below);
 }
 
 /* Lists the constraints violated by more than a margin, both in units of the norm. */
@@ -260,20 +265,26 @@ static int choose_guessed(gpmpc_program *work, const gpmpc_solution *guess)
     return chosen;
 }
 
-/* Writes constraint p, at its upper (``above``) or lower bound, to slot k. */
-static void write_slot(gpmpc_program *work, int k, int p, int above)
+/* Writes w_p = L^-T c_p. */
+static void write_column(const gpmpc_program *work, int p, real *w)
 {
-    real *w = work->w[work->place[k]];
     int end = work->row_end[p];
-    int equality = work->lower[p] == work->upper[p];
-    real cap = work->cap[p];
     fill(w, 0, N);
     if (p < N)
         w[p] = 1;
     else
         copy(work->G[p - N], w, end);
     solve_transposed(&work->L[0][0], N, end, w);
-    work->diagonal[k] = dot(w, w, end);
+}
+
+/* Writes constraint p, at its upper (``above``) or lower bound, to slot k. */
+static void write_slot(gpmpc_program *work, int k, int p, int above)
+{
+    real *w = work->w[work->place[k]];
+    int equality = work->lower[p] == work->upper[p];
+    real cap = work->cap[p];
+    write_column(work, p, w);
+    work->diagonal[k] = dot(w, w, work->row_end[p]);
     work->label[k] = above ? p + 1 : -(p + 1);
     work->bound[k] = above ? work->upper[p] : work->lower[p];
     work->least_multiplier[k] = equality || !above ? -cap : 0;
@@ -415,6 +426,7 @@ static void minimise(gpmpc_program *work, int k)
         subtract_working(work, work->scratch, k, x);
     }
     solve_lower(&work->L[0][0], N, N, x);
+    fill(work->value_low, 0, N);
 }
 
 /* Where the range of a multiplier ends that decreases at this rate. */
@@ -464,7 +476,7 @@ static int satisfy_constraint(gpmpc_program *work, int *size, int p, int *change
     }
     write_slot(work, k, p, above);
     compute_factor_row(work, k, p);
-    violation = (work->value[p] - work->bound[k]) * sense;
+    violation = sense * (above ? above_bound(work, p) : -below_bound(work, p));
     for (;;) {
         real K_pp = work->diagonal[k];
         real d, step, room, range_end;
@@ -616,6 +628,7 @@ static void iterate(gpmpc_program *work, Progress *progress, int starts, int gue
     int k = progress->size;
     int limit = iteration_limit(work);
     int violated = 0;
+    fill(work->multiplier_low, 0, constraint_count(work));
     progress->status = GPMPC_SOLVED;
     while (starts || count > 0) {
         int size_before = k;
@@ -701,9 +714,36 @@ static real relative_residual(const gpmpc_program *work, int slot, real residual
     return larger(residual / scaled_length, residual / (100 * terms));
 }
 
+/* Writes the gradient of the Lagrangian by x, and returns the square of the length of
+   x; in float the values of rows are written, too. */
+static real write_lagrangian(const gpmpc_problem *problem, gpmpc_program *work)
+{
+    const real *x = work->value;
+    real square;
+#if GPMPC_IS_FLOAT
+    multiply(&work->P[0][0], x, N, N, work->scratch);
+    square = dot(work->scratch, x, N);
+    evaluate_along_dynamics(problem, work);
+#else
+    (void)problem;
+    multiply(&work->P[0][0], x, N, N, work->gradient);
+    square = dot(work->gradient, x, N);
+    add_scaled(1, work->slope, work->gradient, N);
+#endif
+    return square;
+}
+
+/* How far a working constraint is above its bound. */
+static real slot_residual(const gpmpc_program *work, int slot)
+{
+    int p = constraint_in(work, slot);
+    return work->label[slot] > 0 ? above_bound(work, p) : -below_bound(work, p);
+}
+
 /* Returns the residual of x on the working set as a share of the length of x, UNDEFINED
    where a number is not finite; writes the length. */
-static real measure_residual(gpmpc_program *work, int k, real *length)
+static real measure_residual(const gpmpc_problem *problem, gpmpc_program *work, int k,
+                             real *length)
 {
     const real *x = work->value;
     real least = work->negligible_length;
@@ -713,12 +753,10 @@ static real measure_residual(gpmpc_program *work, int k, real *length)
     real undefined = 0;
     real worst;
     int i, j;
-    multiply(&work->P[0][0], x, N, N, work->gradient);
-    *length = SQRT(larger(larger(dot(work->gradient, x, N), least * least), TINY));
+    real square = write_lagrangian(problem, work);
+    *length = SQRT(larger(larger(square, least * least), TINY));
     for (j = 0; j < N; j++) {
-        real entry = work->gradient[j] + work->slope[j];
-        real step = absolute(entry) * work->norm[j];
-        work->gradient[j] = entry;
+        real step = absolute(work->gradient[j]) * work->norm[j];
         steps = larger(steps, step);
         shifts = larger(shifts, step * work->norm[j]);
         entries = larger(entries, absolute(x[j]));
@@ -726,12 +764,21 @@ static real measure_residual(gpmpc_program *work, int k, real *length)
     }
     worst = larger(steps / *length, shifts / (100 * entries));
     for (i = 0; i < k; i++) {
-        real residual = work->value[constraint_in(work, i)] - work->bound[i];
+        real residual = slot_residual(work, i);
         work->residual[i] = residual;
         worst = larger(worst, relative_residual(work, i, absolute(residual), *length));
         undefined += 0 * residual;
     }
     return is_finite(worst + undefined + *length) ? worst : UNDEFINED;
+}
+
+/* x[i] <- x[i] + change; in float with what that rounds off */
+static void correct(real *x, real *low, int i, real change)
+{
+    if (GPMPC_IS_FLOAT)
+        add_to(x, low, i, change);
+    else
+        x[i] += change;
 }
 
 /* Takes one Newton step for the residuals; multipliers stay in range. */
@@ -751,23 +798,32 @@ static void take_newton_step(gpmpc_program *work, int k)
         dx[i] = -transformed[i];
     subtract_working(work, dmu, k, dx);
     solve_lower(&work->L[0][0], N, N, dx);
-    add_scaled(1, dx, work->value, N);
-    for (i = 0; i < k; i++)
-        clip_multiplier(work, i, work->multiplier[constraint_in(work, i)] + dmu[i]);
-    multiply_constraints(work);
+    for (i = 0; i < N; i++)
+        correct(work->value, work->value_low, i, dx[i]);
+    for (i = 0; i < k; i++) {
+        int p = constraint_in(work, i);
+        real unclipped;
+        correct(work->multiplier, work->multiplier_low, p, dmu[i]);
+        unclipped = work->multiplier[p];
+        clip_multiplier(work, i, unclipped);
+        if (work->multiplier[p] != unclipped)
+            work->multiplier_low[p] = 0;
+    }
+    if (!GPMPC_IS_FLOAT) /* there values come with the residuals */
+        multiply_constraints(work);
 }
 
 /* Corrects x and the multipliers on the working set until their residual is small, or
    does not halve any more. Returns the residual. */
-static real refine(gpmpc_program *work, int k, real tolerance, real *length,
-                   int *moved)
+static real refine(const gpmpc_problem *problem, gpmpc_program *work, int k,
+                   real tolerance, real *length, int *moved)
 {
     real best = INFINITY;
     real residual = INFINITY;
     int step;
     for (step = 0; step <= REFINEMENTS; step++) {
         add_multipliers(work, k);
-        residual = measure_residual(work, k, length);
+        residual = measure_residual(problem, work, k, length);
         if (residual <= tolerance || step == REFINEMENTS || !(residual < best / 2))
             break;
         best = residual;
@@ -841,6 +897,12 @@ static void write_solution(const gpmpc_program *work, const Progress *progress,
     solution->rows = work->rows;
     solution->working = progress->size;
     copy(work->value, solution->x, N);
+    copy(work->value_low, solution->x_low, N);
+    solution->violation = 0;
+    for (i = 0; i < constraint_count(work); i++)
+        solution->violation = larger(solution->violation,
+                                     larger(above_bound(work, i),
+                                            below_bound(work, i)));
     copy(work->multiplier, solution->multiplier, constraint_count(work));
     for (i = 0; i < progress->size; i++)
         solution->label[i] = work->label[i];
@@ -848,8 +910,8 @@ static void write_solution(const gpmpc_program *work, const Progress *progress,
 
 /* Solves the opened program in rounds: iterate, refine x on its working set, look for
    violations that are left. */
-static void solve_opened(gpmpc_program *work, const gpmpc_solution *guess,
-                         gpmpc_solution *solution)
+static void solve_opened(const gpmpc_problem *problem, gpmpc_program *work,
+                         const gpmpc_solution *guess, gpmpc_solution *solution)
 {
     Progress progress = {GPMPC_NUMERICAL_TROUBLE, 0, 0, BATCHES, 0, 0};
     real margin = LATER * work->length_of_q; /* small ones wait for the refined x */
@@ -872,14 +934,16 @@ static void solve_opened(gpmpc_program *work, const gpmpc_solution *guess,
         }
         first_round = 0;
         for (i = 0; i < progress.size; i++) /* bounds of variables hold exactly */
-            if (constraint_in(work, i) < N)
+            if (constraint_in(work, i) < N) {
                 work->value[constraint_in(work, i)] = work->bound[i];
+                work->value_low[constraint_in(work, i)] = 0;
+            }
         pivot_share = smaller(work->pivot_share,
                               SQRT(least_pivot_share(work, progress.size)));
         finest = finest || progress.passed_over || pivot_share < ILL;
         largest_residual = DOUBT * pivot_share;
         tolerance = smaller(finest ? FINEST : FINE, largest_residual);
-        residual = refine(work, progress.size, tolerance, &length, &changed);
+        residual = refine(problem, work, progress.size, tolerance, &length, &changed);
         progress.status = residual <= smaller(GPMPC_TOLERANCE, largest_residual)
                               ? GPMPC_SOLVED
                               : GPMPC_NUMERICAL_TROUBLE;
@@ -966,27 +1030,30 @@ static int is_certain(gpmpc_program *work, const gpmpc_solution *solution)
            || (solution->status == GPMPC_ITERATION_LIMIT && GPMPC_ITERATIONS > 0);
 }
 
-/* Solves the program with prices (r,) of violated rows of the states, starting from the
-   solution of a similar one, which may be where the new one is written to. A solution
-   that its residuals do not support is tried again from its own working set. */
-static void solve(gpmpc_program *work, const real *prices, const gpmpc_solution *guess,
-                  gpmpc_solution *solution)
+/*{rescue}*/
+
+/* Solves the program of a problem with prices (r,) of violated rows of the states,
+   starting from the solution of a similar one, which may be where the new one is written
+   to. A solution that its residuals do not support is tried again from its own working
+   set, then with doubled digits. */
+static void solve(const gpmpc_problem *problem, gpmpc_program *work,
+                  const gpmpc_solution *guess, gpmpc_solution *solution)
 {
     int iterations;
-    if (!open_program(work, prices)) {
+    if (!open_program(work, problem->prices)) {
         solution->status = GPMPC_NUMERICAL_TROUBLE;
         solution->rows = -1;
         solution->working = 0;
         fill(solution->x, 0, N);
         return;
     }
-    solve_opened(work, guess, solution);
+    solve_opened(problem, work, guess, solution);
     if (is_certain(work, solution))
         return;
     iterations = solution->iterations;
     if (read_bounds(work))
-        solve_opened(work, solution, solution);
+        solve_opened(problem, work, solution, solution);
     solution->iterations += iterations;
-    if (!is_certain(work, solution) && solution->status != GPMPC_ITERATION_LIMIT)
-        solution->status = GPMPC_NUMERICAL_TROUBLE;
+    if (!is_certain(work, solution))
+        rescue_solution(problem, work, solution);
 }

@@ -1,0 +1,493 @@
+/* ------------------------------------------------------------------------------------
+   The dual active set once more, for programs that the working digits cannot decide, as
+   in gpmpc/qp/_dual_rescue.py: the columns L^-T c_p of the working set have a QR factor
+   that is computed anew at each change (Q in ``w``, by rows; R in ``factor``), and x
+   and the multipliers have doubled digits, which Newton's method corrects by residuals
+   of doubled digits.
+   --------------------------------------------------------------------------------- */
+
+enum { CORRECTIONS = 12, DEPENDENT_TRIES = 4 };
+
+enum { OUTSIDE, WORKING, PASSED_OVER }; /* where a constraint is */
+
+typedef struct {
+    const gpmpc_problem *problem; /* NULL: residuals by P and G */
+    real dependent; /* distance from the others, as a share, where rows depend on them */
+    int size;       /* k, of the working set */
+    int iterations;
+    char place[GPMPC_CONSTRAINTS];
+    real length[GPMPC_CONSTRAINTS]; /* of the columns */
+} Rescue;
+
+/* A violated constraint. */
+typedef struct {
+    int p;
+    int side;  /* 1: the upper bound, -1: the lower one */
+    int sense; /* the direction in which the multiplier moves */
+    real amount;
+} Violation;
+
+static void evaluate(const Rescue *rescue, gpmpc_program *work)
+{
+#if GPMPC_IS_FLOAT
+    if (rescue->problem) {
+        evaluate_along_dynamics(rescue->problem, work);
+        return;
+    }
+#endif
+    (void)rescue;
+    evaluate_program(work);
+}
+
+/* Takes what lies along the first k columns of Q off a column; twice is enough. Writes
+   their shares, and returns the length that is left. */
+static real orthogonalise(const gpmpc_program *work, int k, real *column, real *shares)
+{
+    int pass, i;
+    fill(shares, 0, k);
+    for (pass = 0; pass < 2; pass++)
+        for (i = 0; i < k; i++) {
+            real share = dot(work->w[i], column, N);
+            add_scaled(-share, work->w[i], column, N);
+            shares[i] += share;
+        }
+    return SQRT(dot(column, column, N));
+}
+
+/* Appends constraint p to the factor of k columns; returns how far it is from them. */
+static real append_column(gpmpc_program *work, int k, int p)
+{
+    real *column = work->w[k];
+    real distance;
+    int i;
+    write_column(work, p, column);
+    distance = orthogonalise(work, k, column, work->forward);
+    for (i = 0; i < k; i++)
+        work->factor[i][k] = work->forward[i];
+    work->factor[k][k] = distance;
+    for (i = 0; i < N; i++)
+        column[i] /= distance;
+    return distance;
+}
+
+static void factorise_working(const Rescue *rescue, gpmpc_program *work)
+{
+    int i;
+    for (i = 0; i < rescue->size; i++)
+        (void)append_column(work, i, constraint_in(work, i));
+}
+
+/* a <- R^-1 a */
+static void solve_upper(const gpmpc_program *work, int k, real *a)
+{
+    int i, j;
+    for (i = k - 1; i >= 0; i--) {
+        for (j = i + 1; j < k; j++)
+            a[i] -= work->factor[i][j] * a[j];
+        a[i] /= work->factor[i][i];
+    }
+}
+
+/* a <- R^-T a */
+static void solve_upper_transposed(const gpmpc_program *work, int k, real *a)
+{
+    int i, j;
+    for (i = 0; i < k; i++) {
+        for (j = 0; j < i; j++)
+            a[i] -= work->factor[j][i] * a[j];
+        a[i] /= work->factor[i][i];
+    }
+}
+
+/* The range of the multiplier of constraint p at its upper (1) or lower (-1) bound. */
+static real least_of(const gpmpc_program *work, int p, int side)
+{
+    return work->lower[p] == work->upper[p] || side < 0 ? -work->cap[p] : 0;
+}
+
+static real most_of(const gpmpc_program *work, int p, int side)
+{
+    return work->lower[p] == work->upper[p] || side > 0 ? work->cap[p] : 0;
+}
+
+static int side_in(const gpmpc_program *work, int slot)
+{
+    return work->label[slot] > 0 ? 1 : -1;
+}
+
+static void set_multiplier(gpmpc_program *work, int p, real multiplier)
+{
+    work->multiplier[p] = multiplier;
+    work->multiplier_low[p] = 0;
+}
+
+static void add_working(Rescue *rescue, gpmpc_program *work, int p, int side)
+{
+    work->label[rescue->size++] = side * (p + 1);
+    rescue->place[p] = WORKING;
+}
+
+static void drop_working(Rescue *rescue, gpmpc_program *work, int slot, real multiplier)
+{
+    int p = constraint_in(work, slot);
+    int i;
+    set_multiplier(work, p, multiplier);
+    rescue->place[p] = OUTSIDE;
+    rescue->size--;
+    for (i = slot; i < rescue->size; i++)
+        work->label[i] = work->label[i + 1];
+    rescue->iterations++;
+}
+
+/* Starts with the guessed labels, in ``candidates``, that are far from each other: the
+   farthest from the others first. */
+static void start_rescue(Rescue *rescue, gpmpc_program *work, int guessed)
+{
+    int i;
+    rescue->size = 0;
+    rescue->iterations = 0;
+    for (i = 0; i < constraint_count(work); i++) {
+        rescue->place[i] = OUTSIDE;
+        set_multiplier(work, i, 0);
+        work->value[i] = 0;
+        work->value_low[i] = 0;
+    }
+    while (rescue->size < N) {
+        int k = rescue->size;
+        real farthest = GUESS_MARGIN * rescue->dependent;
+        int best = 0;
+        for (i = 0; i < guessed; i++) {
+            int label = work->candidates[i];
+            int p = constraint_of(label);
+            real distance;
+            real bound = label > 0 ? work->upper[p] : work->lower[p];
+            if (rescue->place[p] != OUTSIDE || !is_finite(bound)
+                || !(rescue->length[p] > 0))
+                continue;
+            write_column(work, p, work->w[k]);
+            distance = orthogonalise(work, k, work->w[k], work->forward);
+            if (distance > farthest * rescue->length[p]) {
+                farthest = distance / rescue->length[p];
+                best = label;
+            }
+        }
+        if (!best)
+            break;
+        (void)append_column(work, k, constraint_of(best));
+        add_working(rescue, work, constraint_of(best), best > 0 ? 1 : -1);
+    }
+}
+
+/* Adds the Newton step of the residuals to x and the working multipliers:
+   a = -A_W dmu - L^-T r1, A_W'a = -r2, L dx = a. Returns the length of the step. */
+static real take_accurate_step(Rescue *rescue, gpmpc_program *work)
+{
+    int k = rescue->size;
+    real *a = work->scratch;
+    real *change = work->direction; /* of the multipliers */
+    real longest = 0;
+    int i;
+    evaluate(rescue, work);
+    copy(work->gradient, a, N);
+    solve_transposed(&work->L[0][0], N, N, a);
+    for (i = 0; i < k; i++) {
+        int p = constraint_in(work, i);
+        change[i] = side_in(work, i) > 0 ? above_bound(work, p) : -below_bound(work, p);
+    }
+    solve_upper_transposed(work, k, change);
+    for (i = 0; i < N; i++)
+        a[i] = -a[i];
+    for (i = 0; i < k; i++)
+        change[i] += dot(work->w[i], a, N);
+    for (i = 0; i < k; i++)
+        add_scaled(-change[i], work->w[i], a, N);
+    solve_lower(&work->L[0][0], N, N, a);
+    solve_upper(work, k, change);
+    for (i = 0; i < N; i++) {
+        longest = larger(longest, absolute(a[i]) / work->norm[i]);
+        add_to(work->value, work->value_low, i, a[i]);
+    }
+    for (i = 0; i < k; i++)
+        add_to(work->multiplier, work->multiplier_low, constraint_in(work, i),
+               change[i]);
+    return longest;
+}
+
+/* Finds x and the multipliers of the working set. Returns whether that converges. */
+static int refine_accurately(Rescue *rescue, gpmpc_program *work)
+{
+    int step, i;
+    for (step = 0; step < CORRECTIONS; step++) {
+        real longest = take_accurate_step(rescue, work);
+        real size = work->negligible_length;
+        for (i = 0; i < N; i++)
+            size = larger(size, absolute(work->value[i]) / work->norm[i]);
+        if (!is_finite(size) || !is_finite(longest))
+            return 0;
+        if (longest > CONVERGED * size)
+            continue;
+        for (i = 0; i < rescue->size; i++) { /* bounds of variables hold exactly */
+            int p = constraint_in(work, i);
+            if (p < N) {
+                work->value[p] = side_in(work, i) > 0 ? work->upper[p] : work->lower[p];
+                work->value_low[p] = 0;
+            }
+        }
+        return 1;
+    }
+    return 0;
+}
+
+/* Finds x and the multipliers, dropping the most wrong one until all are in range. */
+static int correct_multipliers(Rescue *rescue, gpmpc_program *work)
+{
+    for (;;) {
+        real worst = 0;
+        real end = 0;
+        int wrong = -1;
+        int i;
+        factorise_working(rescue, work);
+        if (!refine_accurately(rescue, work))
+            return 0;
+        for (i = 0; i < rescue->size; i++) {
+            int p = constraint_in(work, i);
+            real mu = work->multiplier[p];
+            real least = least_of(work, p, side_in(work, i));
+            real most = most_of(work, p, side_in(work, i));
+            real beyond = larger(mu - most, least - mu) * rescue->length[p];
+            if (beyond > worst) {
+                worst = beyond;
+                wrong = i;
+                end = mu > most ? most : least;
+            }
+        }
+        if (wrong < 0)
+            return 1;
+        drop_working(rescue, work, wrong, is_finite(end) ? end : 0);
+    }
+}
+
+/* sum |c_pj x_j|, of which the value of constraint p is made */
+static real terms_of(const gpmpc_program *work, int p)
+{
+    real terms = 0;
+    int j;
+    if (p < N)
+        return absolute(work->value[p]);
+    for (j = 0; j < work->row_end[p]; j++)
+        terms += absolute(work->G[p - N][j] * work->value[j]);
+    return terms;
+}
+
+/* Finds the most violated constraint. Returns whether there is one. */
+static int find_violation(const Rescue *rescue, gpmpc_program *work,
+                          Violation *violation)
+{
+    real worst = 0;
+    int p;
+    evaluate(rescue, work);
+    violation->p = -1;
+    violation->side = 0;
+    violation->sense = 0;
+    violation->amount = 0;
+    for (p = 0; p < constraint_count(work); p++) {
+        real mu = work->multiplier[p];
+        real above = is_finite(work->upper[p]) ? above_bound(work, p) : -INFINITY;
+        real below = is_finite(work->lower[p]) ? below_bound(work, p) : -INFINITY;
+        real excess, terms, share;
+        if (rescue->place[p] != OUTSIDE)
+            continue;
+        excess = larger(above, below);
+        if (mu != 0) /* one at a cap must stay outside its bound */
+            excess = mu > 0 ? -above : -below;
+        if (!(excess > 0))
+            continue;
+        terms = larger(terms_of(work, p), absolute(work->value[p] + excess));
+        if (!(excess > UNNOTICED * terms))
+            continue;
+        excess -= NEGLIGIBLE * larger(terms, work->length_of_q * work->norm[p]);
+        share = excess / (rescue->length[p] > 0 ? rescue->length[p] : 1);
+        if (!(share > worst))
+            continue;
+        worst = share;
+        violation->p = p;
+        violation->amount = excess;
+        violation->side = above > below ? 1 : -1;
+        violation->sense = violation->side;
+        if (mu != 0) {
+            violation->side = mu > 0 ? 1 : -1;
+            violation->sense = -violation->side;
+        }
+    }
+    return violation->p >= 0;
+}
+
+/* Finds the longest step up to ``*step`` that keeps the working multipliers, which
+   decrease at rates sense r, in range. Returns the slot that ends it, or -1. */
+static int first_to_block(const Rescue *rescue, const gpmpc_program *work, int sense,
+                          real *step)
+{
+    real largest = 0;
+    int blocking = -1;
+    int i;
+    for (i = 0; i < rescue->size; i++)
+        largest = larger(largest, absolute(work->direction[i])
+                                      * rescue->length[constraint_in(work, i)]);
+    for (i = 0; i < rescue->size; i++) {
+        int p = constraint_in(work, i);
+        real rate = (real)sense * work->direction[i];
+        real end, room;
+        if (!(absolute(rate) * rescue->length[p] > ROUNDING_OF_DATA * largest))
+            continue;
+        end = rate > 0 ? least_of(work, p, side_in(work, i))
+                       : most_of(work, p, side_in(work, i));
+        room = larger(0, (work->multiplier[p] - end) / rate);
+        if (room < *step) {
+            *step = room;
+            blocking = i;
+        }
+    }
+    return blocking;
+}
+
+/* Moves multipliers until a constraint is satisfied. Returns 0 where it cannot be, or
+   is violated by no more than ``rounding``: ``direction`` is then the combination of
+   working ones that it is. */
+static int satisfy_accurately(Rescue *rescue, gpmpc_program *work,
+                              const Violation *violation, real rounding)
+{
+    int p = violation->p;
+    real sense = (real)violation->sense;
+    real amount = violation->amount;
+    real multiplier_before = work->multiplier[p];
+    for (;;) {
+        int k = rescue->size;
+        real distance, square, step, room;
+        int independent, capped, blocking, i;
+        factorise_working(rescue, work);
+        write_column(work, p, work->w[k]);
+        distance = orthogonalise(work, k, work->w[k], work->direction);
+        solve_upper(work, k, work->direction);
+        square = distance * distance;
+        independent = k < N && distance > rescue->dependent * rescue->length[p];
+        step = independent ? amount / square : INFINITY;
+        room = sense > 0 ? most_of(work, p, violation->side) - work->multiplier[p]
+                         : work->multiplier[p] - least_of(work, p, violation->side);
+        capped = room < step;
+        step = smaller(step, room);
+        blocking = first_to_block(rescue, work, violation->sense, &step);
+        if (step > LARGEST || (!independent && amount <= rounding)) {
+            set_multiplier(work, p, multiplier_before);
+            return 0;
+        }
+        for (i = 0; i < k; i++) {
+            int w = constraint_in(work, i);
+            set_multiplier(work, w,
+                           work->multiplier[w] - sense * step * work->direction[i]);
+        }
+        set_multiplier(work, p, work->multiplier[p] + sense * step);
+        amount -= step * square;
+        if (blocking < 0) {
+            rescue->iterations++;
+            if (!capped)
+                add_working(rescue, work, p, violation->side);
+            return 1;
+        }
+        {
+            int leaving = constraint_in(work, blocking);
+            real rate = sense * work->direction[blocking];
+            int side = side_in(work, blocking);
+            drop_working(rescue, work, blocking,
+                         rate > 0 ? least_of(work, leaving, side)
+                                  : most_of(work, leaving, side));
+        }
+    }
+}
+
+/* Writes Farkas' proof to the multipliers, given the combination in ``direction``.
+   Returns whether it is one. */
+static int prove_contradiction(const Rescue *rescue, gpmpc_program *work,
+                               const Violation *violation)
+{
+    real *ray = work->excess;
+    int i;
+    fill(ray, 0, constraint_count(work));
+    for (i = 0; i < rescue->size; i++) {
+        int p = constraint_in(work, i);
+        real share = -(real)violation->sense * work->direction[i];
+        int pulls = share * (real)side_in(work, i) >= 0;
+        if (absolute(share) * rescue->length[p]
+                > rescue->dependent * rescue->length[violation->p]
+            && (pulls || work->lower[p] == work->upper[p]))
+            ray[p] = share;
+    }
+    ray[violation->p] = (real)violation->sense;
+    if (!proves_infeasibility(work, ray))
+        return 0;
+    copy(ray, work->multiplier, constraint_count(work));
+    return 1;
+}
+
+/* Changes the working set until no constraint is violated; returns the status. */
+static int run_rescue(Rescue *rescue, gpmpc_program *work)
+{
+    for (;;) {
+        Violation violation;
+        real rounding;
+        int i;
+        if (!correct_multipliers(rescue, work))
+            return GPMPC_NUMERICAL_TROUBLE;
+        if (!find_violation(rescue, work, &violation))
+            return GPMPC_SOLVED;
+        if (rescue->iterations >= iteration_limit(work))
+            return GPMPC_ITERATION_LIMIT;
+        rounding = larger(terms_of(work, violation.p),
+                          absolute(violation.side > 0 ? work->upper[violation.p]
+                                                      : work->lower[violation.p]));
+        rounding *= ROUNDING_OF_DATA;
+        if (satisfy_accurately(rescue, work, &violation, rounding))
+            continue;
+        if (prove_contradiction(rescue, work, &violation))
+            return GPMPC_INFEASIBLE;
+        for (i = 0; i < rescue->size; i++) {
+            int p = constraint_in(work, i);
+            real bound = side_in(work, i) > 0 ? work->upper[p] : work->lower[p];
+            rounding += ROUNDING_OF_DATA * absolute(work->direction[i])
+                        * larger(terms_of(work, p), absolute(bound));
+        }
+        if (violation.amount > rounding)
+            return GPMPC_NUMERICAL_TROUBLE;
+        rescue->place[violation.p] = PASSED_OVER;
+    }
+}
+
+/* Solves a program once more from the working set of a solution, which it replaces. */
+static void rescue_solution(const gpmpc_problem *problem, gpmpc_program *work,
+                            gpmpc_solution *solution)
+{
+    static const real dependent[DEPENDENT_TRIES] = DEPENDENT_DISTANCES;
+    Progress progress = {GPMPC_NUMERICAL_TROUBLE, 0, 0, 0, 0, 0};
+    Rescue rescue;
+    int guessed = solution->working;
+    int attempt, i;
+    for (i = 0; i < guessed; i++)
+        work->candidates[i] = solution->label[i];
+    for (i = 0; i < constraint_count(work); i++) {
+        write_column(work, i, work->scratch);
+        rescue.length[i] = SQRT(dot(work->scratch, work->scratch, N));
+    }
+    for (attempt = 0; attempt < 2 * DEPENDENT_TRIES; attempt++) {
+        rescue.problem = attempt < DEPENDENT_TRIES ? problem : 0;
+        rescue.dependent = dependent[attempt % DEPENDENT_TRIES]
+                           / SQRT(work->pivot_share);
+        if (!GPMPC_IS_FLOAT && attempt >= DEPENDENT_TRIES)
+            break;
+        start_rescue(&rescue, work, guessed);
+        progress.status = run_rescue(&rescue, work);
+        if (progress.status != GPMPC_NUMERICAL_TROUBLE)
+            break;
+    }
+    progress.iterations = solution->iterations + rescue.iterations;
+    progress.size = rescue.size;
+    write_solution(work, &progress, solution);
+}
