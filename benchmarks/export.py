@@ -11,9 +11,10 @@ of these flights (belief, reference, last decision) goes to the compiled C as we
 double and in float. Every flight has a seed, of its noise and of what disturbs its
 start, its reference or its wind.
 With ``--sanitize`` every question goes to a build with clang's sanitizers of addresses
-and undefined behaviour as well, which end the process at a fault; start it with
-``LD_PRELOAD=$(clang -print-file-name=libclang_rt.asan-x86_64.so) ASAN_OPTIONS=
-detect_leaks=0``.
+and undefined behaviour as well, which end the process at a fault. Their runtime has to
+be preloaded (``LD_PRELOAD=$(clang -print-file-name=libclang_rt.asan-x86_64.so)
+ASAN_OPTIONS=detect_leaks=0``), before it a ``dlopen`` that drops ``RTLD_DEEPBIND``, with
+which CasADi opens its plugins.
 Printed for each: questions, the largest difference of an input, as a share of the
 input's range in brackets, other statuses, and the median time of a step of Python and
 of C alone [ms]. Writes ``outputs/benchmarks/export.json``.

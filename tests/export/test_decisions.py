@@ -215,12 +215,45 @@ def test_holds_the_input_where_that_is_asked():
 
 
 def test_float_differs_by_little():
-    controller = tube("exact")
+    """By 1e-4 of the torques' range, and with the same statuses."""
+    controller = tube("elastic")
     python = ControlLoop(controller)
     compiled = CompiledLoop(controller, precision="float", compiler=COMPILER)
     for measured, reference in questions(controller, 40):
         expected = python.input(measured, reference)
         assert np.abs(compiled.input(measured, reference) - expected).max() < 4e-4
+        assert python.last is not None
+        assert compiled.status is python.last.status
+
+
+def test_answers_what_needs_doubled_digits():
+    """A soft bound far out of reach of a plant that quadruples its state at each step.
+
+    Sixteen digits do not tell which bounds hold: Python solves it in doubled ones.
+    """
+    plant = Affine(
+        torch.tensor([[4.0, 1.0], [0.0, 2.0]]),
+        torch.tensor([[0.0], [1.0]]),
+        torch.zeros(2),
+    )
+    model = KnownModel(plant, state_dim=2, input_dim=1)
+    ceiling = Box(upper=[1.0, np.inf])
+    problem = Problem(
+        Tracking([1.0, 0.1], [1e-3]),
+        TORQUES,
+        input_rates=Box([-0.5], [0.5]),
+        constraints=[ceiling],
+    )
+    controller = gpmpc(problem, model, horizon=10, covariance="none")
+    compiled = CompiledController(controller, compiler=COMPILER)
+    for scale in (0.1, 1.0, 10.0, 100.0):
+        for sign in (-1.0, 1.0):
+            belief = Gaussian.certain(scale * np.array([1.0, sign]))
+            expected = controller.control(belief, Reference(np.zeros(2)))
+            got = compiled.control(belief, Reference(np.zeros(2)))
+            assert got.status is expected.status
+            assert np.abs(got.input - expected.input).max() < 1e-9
+            assert expected.status is Status.SOFT_BOUND_MISSED
 
 
 def test_flies_in_closed_loop():
