@@ -62,6 +62,7 @@ class SlurmActs:
             "scancel of a whole array": self._all_cancelled,
             "a job over its memory": self._memory,
             "a job over its wall time": self._wall_time,
+            "a running job started anew": self._requeued,
             "a node killed": self._node,
             "the driver killed and called again": self._driver,
             "three drivers on one sweep": self._three_drivers,
@@ -120,6 +121,15 @@ class SlurmActs:
         act.check(code, self._stage.reference)
         assert [error["kind"] for error in act.errors()] == ["time"]
         assert "hydra.launcher.timeout_min" in printed
+
+    def _requeued(self) -> None:
+        def requeue() -> None:
+            self._slurm.ask("scontrol", "requeue", self._number(act, "RUNNING"))
+
+        act = self._sweep("requeued")
+        code, printed = _fly_through(act, 4, requeue)
+        assert code == 0, printed
+        act.check(code, self._stage.reference)
 
     def _node(self) -> None:
         act = self._sweep("node")

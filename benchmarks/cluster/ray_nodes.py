@@ -33,7 +33,7 @@ class RayNodes:
     Args:
         folder: Where it keeps everything; its path is short, since sockets lie there.
         blind_to: A folder that the second node does not see.
-        variables: Of the environment of all tasks.
+        variables: Of the environment of all tasks, and not of commands.
     """
 
     def __init__(
@@ -44,11 +44,12 @@ class RayNodes:
     ):
         self.folder = folder
         self.blind_to = blind_to
+        #: what a command needs
         self.environment = os.environ | {
             "RAY_AUTH_MODE": "disabled",
             "RAY_USAGE_STATS_ENABLED": "0",
-            **(variables or {}),
         }
+        self._environment_of_tasks = {**self.environment, **(variables or {})}
         (self._port,) = free_ports(1)
         self._daemons: dict[str, subprocess.Popen] = {}
 
@@ -85,7 +86,7 @@ class RayNodes:
         self.folder.mkdir(parents=True, exist_ok=True)
         log = self.folder.with_name(f"{self.folder.name}-{name}.out")
         log.unlink(missing_ok=True)
-        self._daemons[name] = start_daemon(command, self.environment, log)
+        self._daemons[name] = start_daemon(command, self._environment_of_tasks, log)
         wait_for(f"ray, {name}", lambda: "Ray runtime started" in log.read_text())
 
     def kill_node(self, name: str) -> None:
