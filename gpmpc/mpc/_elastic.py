@@ -66,9 +66,9 @@ def elastic_price(
     largest = np.linalg.eigvalsh(of_stages).max(axis=1, keepdims=True) * squares
     weights = np.where(weights > _TINY * largest, weights, largest)
     # The cheapest move by a violation v along a gradient g has the size v / |g|.
-    beside = weights / np.maximum(squares, _TINY) ** 2 * missed**2
+    moving_costs = weights / np.maximum(squares, _TINY) ** 2 * missed**2
     cost = min(max(free_cost, last_cost), 2.0 * free_cost)
-    return WORTH * (cost + beside.sum()) / max(missed.sum(), _TINY)
+    return WORTH * (cost + moving_costs.sum()) / max(missed.sum(), _TINY)
 
 
 def _by_stage(parts: Array, horizon: int) -> Array:

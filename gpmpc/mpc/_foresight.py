@@ -19,7 +19,7 @@ from gpmpc._kernels.gp_rollout import Feedback
 from gpmpc.exceptions import SettingError
 from gpmpc.models import RollOut
 from gpmpc.mpc._controller import Decision, Reference, Timing
-from gpmpc.mpc._question import Question, first_weight, held
+from gpmpc.mpc._question import Question, first_weight, hold_last
 from gpmpc.mpc._riccati import finite_horizon_lqr
 from gpmpc.mpc._stage_meter import StageMeter
 from gpmpc.mpc.gp_mpc import GPMPC
@@ -267,8 +267,8 @@ class Foresight:
         """
         length = len(inputs)
         problem = self.controller.prediction.problem
-        lower, upper = (held(side, length) for side in problem.inputs.sides)
-        down, up = (held(side, length) for side in problem.input_rates.sides)
+        lower, upper = (hold_last(side, length) for side in problem.inputs.sides)
+        down, up = (hold_last(side, length) for side in problem.input_rates.sides)
         law = Feedback(
             states=np.ascontiguousarray(states[None, :-1]),
             inputs=np.ascontiguousarray(inputs[None]),

@@ -30,11 +30,11 @@ class Question(NamedTuple):
         reference = self.reference
         inputs = reference.inputs
         if inputs is not None:
-            inputs = held(np.asarray(inputs), horizon)
+            inputs = hold_last(np.asarray(inputs), horizon)
         kappas = reference.kappas
         if kappas is not None:
-            kappas = held(np.asarray(kappas), horizon)
-        states = held(np.asarray(reference.states), horizon + 1)
+            kappas = hold_last(np.asarray(kappas), horizon)
+        states = hold_last(np.asarray(reference.states), horizon + 1)
         parameters = self.parameters
         if parameters is not None:
             parameters = rows_over(parameters, horizon)
@@ -58,8 +58,8 @@ class Question(NamedTuple):
         return Gaussian(torch.as_tensor(np.ascontiguousarray(state)), self.covariance)
 
 
-def held(rows: Array, count: int) -> Array:
-    """Returns the first rows, the last one repeated up to a count."""
+def hold_last(rows: Array, count: int) -> Array:
+    """Returns as many rows as counted, the last one repeated where some are missing."""
     rows = rows[:count]
     missing = count - len(rows)
     if missing > 0:
@@ -69,7 +69,7 @@ def held(rows: Array, count: int) -> Array:
 
 def rows_over(parameters: Any, count: int) -> Array:
     """Returns parameters of stages (count, q), from (q,) or those of others."""
-    return held(np.atleast_2d(np.asarray(parameters, dtype=float)), count)
+    return hold_last(np.atleast_2d(np.asarray(parameters, dtype=float)), count)
 
 
 def first_weight(weight: Array) -> Array:

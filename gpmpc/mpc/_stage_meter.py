@@ -13,7 +13,7 @@ from gpmpc.mpc._constraints import ConstraintRows
 from gpmpc.mpc._controller import FEASIBLE
 from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._linear_quadratic import Plan
-from gpmpc.mpc._question import Question, held, rows_over
+from gpmpc.mpc._question import Question, hold_last, rows_over
 from gpmpc.mpc.problem import Problem
 
 Array = np.ndarray
@@ -42,11 +42,11 @@ class StageMeter:
         reference = question.reference
         reference_inputs = None
         if reference.inputs is not None:
-            reference_inputs = held(np.asarray(reference.inputs), count)
+            reference_inputs = hold_last(np.asarray(reference.inputs), count)
         costs = self._problem.cost.paid(
             states=states,
             inputs=inputs,
-            references=held(np.asarray(reference.states), count + 1),
+            references=hold_last(np.asarray(reference.states), count + 1),
             previous_input=question.previous_input,
             reference_inputs=reference_inputs,
         )
@@ -67,8 +67,8 @@ class StageMeter:
         next_states = states[1:]
         for first in range(0, count, H):
             end = min(first + H, count)
-            chunk_states = held(next_states[first:end], H)
-            chunk_inputs = held(inputs[first:end], H)
+            chunk_states = hold_last(next_states[first:end], H)
+            chunk_inputs = hold_last(inputs[first:end], H)
             chunk_parameters = None
             if parameters is not None:
                 chunk_parameters = rows_over(parameters, first + H)[first:]

@@ -121,7 +121,7 @@ class _Memory(NamedTuple):
             arrives=flight.arrives,
         )
 
-    def continued(self, costs: Array) -> "_Memory":
+    def after_decision(self, costs: Array) -> "_Memory":
         """Returns it after one more decision of the controller, with its plan's costs.
 
         Costs are those of the stages (H,).
@@ -133,7 +133,7 @@ class _Memory(NamedTuple):
             flight=None,
         )
 
-    def followed(self, flight: Flight, horizon: int) -> "_Memory":
+    def after_flown_stage(self, flight: Flight, horizon: int) -> "_Memory":
         """Returns it after one more decision along a flight, from that decision on."""
         return self._replace(
             remaining=self.remaining - float(self.costs[0]),
@@ -142,7 +142,7 @@ class _Memory(NamedTuple):
             flight=flight,
         )
 
-    def passed(self, decision: Decision, horizon: int) -> "_Memory":
+    def after_failed_steps(self, decision: Decision, horizon: int) -> "_Memory":
         """Returns it with its flight from a decision's step on.
 
         A failed step may have left stages behind, which are paid by now. Of a flight
@@ -416,21 +416,49 @@ class ManyStarts:
         """
         question = self._question(situation)
         memory = self._memory(situation)
-        previous = situation.previous
         current = None  # what is left of the flight that was followed
         if memory is not None and memory.flight is not None:
             current = self._remaining_flight(memory.flight, memory, situation, question)
-            memory = memory.followed(current, self.horizon)
+            memory = memory.after_flown_stage(current, self.horizon)
             if self._is_as_promised(current, memory):
-                return self._along(current, memory, situation, question)
-        elif previous is not None and self._can_continue(previous):
-            decision = self._improve(situation, previous)
-            costs = self._foresight.meter(decision.means, decision.inputs, question)
-            if decision.applicable and not self._is_lost(costs, memory):
-                next_memory = _Memory.of_plan(np.array(situation.end), costs)
-                if memory is not None:
-                    next_memory = memory.continued(costs)
-                return _FollowedDecision.of(decision, next_memory)
+                return self._decide_along(current, memory, situation, question)
+        else:
+            decision = self._continue_plan(situation, question, memory)
+            if decision is not None:
+                return decision
+        return self._search_anew(situation, question, memory, current)
+
+    def _continue_plan(
+        self, situation: _Situation, question: Question, memory: _Memory | None
+    ) -> Decision | None:
+        """Returns the controller's decision from its last plan.
+
+        None where there is no plan, or where it has lost the goal.
+        """
+        previous = situation.previous
+        if previous is None or not self._can_continue(previous):
+            return None
+        decision = self._improve(situation, previous)
+        costs = self._foresight.meter(decision.means, decision.inputs, question)
+        if not decision.applicable or self._is_lost(costs, memory):
+            return None
+        next_memory = _Memory.of_plan(np.array(situation.end), costs)
+        if memory is not None:
+            next_memory = memory.after_decision(costs)
+        return _FollowedDecision.of(decision, next_memory)
+
+    def _search_anew(
+        self,
+        situation: _Situation,
+        question: Question,
+        memory: _Memory | None,
+        current: Flight | None,
+    ) -> Decision:
+        """Returns the decision along the cheapest flight of a search.
+
+        ``current`` is what is left of the flight that was followed. Where no flight is
+        found the decision is that of the best plan.
+        """
         flight = self._search_flight(situation, question, current)
         if flight is None:
             return self._search_plan(situation)
@@ -440,7 +468,7 @@ class ManyStarts:
             horizon=self.horizon,
             last=memory,
         )
-        return self._along(flight, memory, situation, question)
+        return self._decide_along(flight, memory, situation, question)
 
     def _remaining_flight(
         self,
@@ -494,7 +522,7 @@ class ManyStarts:
             return None
         if not np.array_equal(previous.memory.goal, situation.end):
             return None
-        return previous.memory.passed(previous, self.horizon)
+        return previous.memory.after_failed_steps(previous, self.horizon)
 
     def _is_lost(self, costs: Array, memory: _Memory | None) -> bool:
         """Tells whether a plan of stages with costs (H,) is to be searched anew."""
@@ -506,7 +534,7 @@ class ManyStarts:
         is_dearer = rise > _RISE * memory.promised
         return is_dearer or memory.age >= self._foresight.longest
 
-    def _along(
+    def _decide_along(
         self,
         flight: Flight,
         memory: _Memory,
@@ -538,7 +566,7 @@ class ManyStarts:
         )
         if current is not None and np.isfinite(current.cost):
             search.add(current)
-        for beginning in self._alone(situation):
+        for beginning in self._controller_beginnings(situation):
             search.fly(beginning)
             if search.is_late:
                 break
@@ -551,7 +579,7 @@ class ManyStarts:
             return None
         return self._foresight.follow(best, situation.state, question)
 
-    def _alone(self, situation: _Situation) -> Iterator[Trajectory]:
+    def _controller_beginnings(self, situation: _Situation) -> Iterator[Trajectory]:
         """Makes beginnings of the controller by itself.
 
         That is from its last plan, without one, and with shorter horizons.

@@ -30,7 +30,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -450,6 +450,15 @@ class NonlinearGPMPC(GPMPC):
         )
 
 
+class _Ending(NamedTuple):
+    """How an iteration ends, unless a broken promise is worth one more program."""
+
+    local: LocalProblem  # with the last plan
+    status: Status
+    # whether the plan misses curved bounds by more than its program promised
+    breaks_promise: bool
+
+
 class _ControlStep:
     """One decision's programs, from a first guess to a plan that is good enough."""
 
@@ -496,23 +505,15 @@ class _ControlStep:
                     local = self._close_defects(local, local, program)
                 return self._conclude(local, guess, solution, solution.status)
             iterate = self._take_step(local, program, solution)
-            status = iterate.status
-            if status is None and self._may_go_on:
+            if iterate.status is None and self._may_go_on:
                 local = iterate.local
                 continue
-            ending = iterate.local
-            if iterate.leaves_defects or self._prediction.rolls_out:
-                ending = self._close_defects(ending, local, program)
-            breaks_promise = self._breaks_promise(status, ending, solution)
-            if breaks_promise and self._may_go_on:
+            ending = self._end(iterate, local, program, solution)
+            if ending.breaks_promise and self._may_go_on:
                 # A curved bound lies elsewhere than the program saw it.
-                local = self._prediction.linearize(ending.plan, self._request)
+                local = self._prediction.linearize(ending.local.plan, self._request)
                 continue
-            # Who asked for a single program takes the plan as it is.
-            is_stopped_early = breaks_promise and self._most_programs > 1
-            if status is None or is_stopped_early:
-                status = self._limit
-            return self._conclude(ending, guess, solution, status)
+            return self._conclude(ending.local, guess, solution, ending.status)
 
     @property
     def _may_go_on(self) -> bool:
@@ -666,6 +667,32 @@ class _ControlStep:
             np.ascontiguousarray(solution.x, dtype=np.float64),
         )
         return local._replace(plan=Plan(states, inputs, local.covariances))
+
+    def _end(
+        self,
+        iterate: Iterate,
+        local: LocalProblem,
+        program: CondensedProgram,
+        solution: QPSolution,
+    ) -> _Ending:
+        """Returns how the iteration ends with the plan that a step led to.
+
+        Args:
+            iterate: What the step led to.
+            local: The problem that the step started from.
+            program: Of that problem.
+            solution: Of the program.
+        """
+        ending = iterate.local
+        if iterate.leaves_defects or self._prediction.rolls_out:
+            ending = self._close_defects(ending, local, program)
+        status = iterate.status
+        breaks_promise = self._breaks_promise(status, ending, solution)
+        # Who asked for a single program takes the plan as it is.
+        is_stopped_early = breaks_promise and self._most_programs > 1
+        if status is None or is_stopped_early:
+            status = self._limit
+        return _Ending(ending, status, breaks_promise)
 
     def _close_defects(
         self, ending: LocalProblem, local: LocalProblem, program: CondensedProgram
