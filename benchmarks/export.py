@@ -13,8 +13,8 @@ start, its reference or its wind.
 With ``--sanitize`` every question goes to a build with clang's sanitizers of addresses
 and undefined behaviour as well, which end the process at a fault. Their runtime has to
 be preloaded (``LD_PRELOAD=$(clang -print-file-name=libclang_rt.asan-x86_64.so)
-ASAN_OPTIONS=detect_leaks=0``), before it a ``dlopen`` that drops ``RTLD_DEEPBIND``, with
-which CasADi opens its plugins.
+ASAN_OPTIONS=detect_leaks=0``), and before it a ``dlopen`` that drops the flag
+``RTLD_DEEPBIND``, with which CasADi opens its plugins.
 Printed for each: questions, the largest difference of an input, as a share of the
 input's range in brackets, other statuses, and the median time of a step of Python and
 of C alone [ms]. Writes ``outputs/benchmarks/export.json``.

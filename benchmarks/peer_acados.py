@@ -13,7 +13,8 @@ last primal and dual solution, shifted by a stage.
 
 Times include the calls of its Python interface, as a Python user pays them; ``inside``
 is what acados reports as its own total. The *real-time iteration* is one quadratic
-program a step by acados' ``SQP_RTI``, beside one program a step of ours.
+program a step by acados' ``SQP_RTI``, beside one program a step of ours, in Python and
+as exported C (``inside``: the call of C alone).
 
 acados is built from its sources (https://docs.acados.org/installation): this file needs
 ``acados_template``, ``ACADOS_SOURCE_DIR`` and its libraries on ``LD_LIBRARY_PATH``. It
@@ -26,7 +27,7 @@ import importlib
 import importlib.util
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import casadi
@@ -45,8 +46,9 @@ from benchmarks.timing import (
     write_results,
 )
 from gpmpc.exceptions import SettingError
+from gpmpc.export import CompiledController
 from gpmpc.gp import GPPosterior
-from gpmpc.mpc import GPMPC, PredictionSettings, Problem
+from gpmpc.mpc import GPMPC, Decision, PredictionSettings, Problem
 from gpmpc.propagation import Linearization
 
 MISSING = (
@@ -59,6 +61,7 @@ QP_TOLERANCE = 1e-8  # of HPIPM; as loose as its default, 94 % of plans are with
 OURS = 1e-4  # of ours
 COMPILE_FLAGS = "-O3 -march=native"
 RIVAL = "acados, SQP, HPIPM"
+IN_C = "gpmpc, exported C"
 
 Array = np.ndarray
 
@@ -235,9 +238,31 @@ def _set_cost(cost: Any, problem: Problem, n: int, m: int) -> None:
     cost.yref_e = np.zeros(n)
 
 
+class Exported:
+    """Our controller as compiled C.
+
+    Attributes:
+        inside: What each call of C took [s].
+    """
+
+    def __init__(self, controller: GPMPC):
+        self._compiled = CompiledController(controller)
+        self._start = peers.by_controller(self._compiled)
+        self.inside: list[float] = []
+
+    def __call__(self, instance: Instance, last: Decision | None) -> Decision:
+        """Decides for an instance, from the memory of the last decision."""
+        if last is None:
+            return self._start(instance, None)
+        previous = replace(last, input=instance.last)
+        decision = self._compiled.control(instance.belief, instance.reference, previous)
+        self.inside.append(decision.timing.solve)
+        return decision
+
+
 def main() -> None:
     """Measures and prints."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--horizons", type=int, nargs="+", default=[10, 20])
     parser.add_argument(
         "--seconds", type=float, default=20.0, help="processor time of each table [s]"
@@ -273,10 +298,13 @@ def measure(
     rival = Acados(gp, problem, horizon)
     real_time = Acados(gp, problem, horizon, method="SQP_RTI")
     ours = peers.by_controller(_controller(gp, problem, horizon, iterations=50))
-    one_program = peers.by_controller(_controller(gp, problem, horizon, iterations=1))
+    controller = _controller(gp, problem, horizon, iterations=1)
+    one_program = peers.by_controller(controller)
+    in_c = Exported(controller)
     converged: peers.Cases = {peers.OWN: lambda: ours, RIVAL: lambda: rival}
     programs: peers.Cases = {
         peers.OWN: lambda: one_program,
+        IN_C: lambda: in_c,
         "acados, real-time iteration": lambda: real_time,
     }
     tables = [("converged", start, converged, rival) for start in starts]
@@ -288,6 +316,9 @@ def measure(
             cases, gp, problem, instances, seconds, cold=start == "cold"
         )
         rows[-1]["inside"] = 1e3 * float(np.median(solver.inside))
+        for row in rows:
+            if row["what"] == IN_C:
+                row["inside"] = 1e3 * float(np.median(in_c.inside))
         label = {"kind": kind, "start": start, "H": horizon}
         sections.append([label | row for row in rows])
     return sections
