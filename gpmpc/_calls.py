@@ -93,7 +93,7 @@ def check_call(
         reason = str(error)
     else:
         return
-    names = [key for key in signature.parameters if key != "self"]
+    names = [key for key in signature.parameters if key not in ("self", "cls")]
     takes = f"{name} takes {', '.join(names) or 'no arguments'}"
     for keyword in keywords:
         if keyword not in signature.parameters:

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._functions import call
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays
@@ -123,6 +124,7 @@ def linearization_of(model: DynamicsModel) -> Callable[..., Linearized]:
     return partial(linearize_by_autograd, model) if method is None else method
 
 
+@explains_arguments
 def linearize(
     model: DynamicsModel, states: Array, inputs: Array, covariance: bool = True
 ) -> Linearized:
@@ -338,8 +340,10 @@ def check_next_states(model: Any) -> tuple[int, int]:
     Raises:
         SettingError: It predicts something else, or is no model.
     """
-    if not hasattr(model, "predict"):
+    if isinstance(model, type) or not hasattr(model, "predict"):
         got = type(model).__name__
+        if isinstance(model, type):
+            got = f"the class {model.__name__}"
         rule = "must be a DynamicsModel, such as GPPosterior"
         raise SettingError("model", f"{rule}; got {got}")
     if model.output_dim != model.state_dim:

@@ -68,7 +68,7 @@ def existing_file(path: str | Path, expected: str) -> Path:
         DataError: There is none.
         SettingError: ``path`` is no path.
     """
-    if not os.path.isfile(_path(path)):
+    if not os.path.isfile(as_path(path)):
         raise DataError(f"{path}: no such file; expected {expected}")
     return Path(path)
 
@@ -80,13 +80,14 @@ def new_file(path: str | Path) -> Path:
         DataError: Its folder does not exist.
         SettingError: ``path`` is no path.
     """
-    path = _path(path)
+    path = as_path(path)
     if not path.parent.is_dir():
         raise DataError(f"{path}: the folder {path.parent} does not exist")
     return path
 
 
-def _path(path: Any) -> Path:
+def as_path(path: Any) -> Path:
+    """Returns a path as such; raises ``SettingError`` where it is none."""
     if not isinstance(path, str | Path):
         raise SettingError("path", f"must be the name of one file; got {path!r}")
     return Path(path)

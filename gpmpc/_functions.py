@@ -52,6 +52,8 @@ DYNAMICS_RULE = (
     "where, ...), for floats, arrays and CasADi"
 )
 _UNDECIDED = ("truth value", "Boolean value")  # of what has no single one
+_FILLED = "setting an array element"
+_LISTED = "a list of entries in the place of an array that is filled one by one"
 _DECISION = (
     "gpmpc.systems.where, min or max for if, and, or, min, max of what has no number "
     "yet"
@@ -116,6 +118,8 @@ def dynamics_advice(error: BaseException, packages: Sequence[str]) -> str | None
     """
     if any(words in str(error) for words in _UNDECIDED):
         return f"{DYNAMICS_RULE}: {_DECISION}"
+    if _FILLED in str(error):
+        return f"{DYNAMICS_RULE}: {_LISTED}"
     if type(error).__module__.partition(".")[0] == "numpy":
         packages = (*packages, "numpy")
     foreign = _foreign_calls(error, packages)

@@ -7,9 +7,11 @@ process (its constructor's arguments are its ``args``).
 """
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from numbers import Integral, Real
 from typing import Any
+
+_LONG = 40  # characters of a value that a message still quotes
 
 
 class GpmpcError(Exception):
@@ -150,6 +152,44 @@ def check_kind(
     if isinstance(value, type):
         got = f"the class {value.__name__}"
     raise SettingError(key, f"must be {example}; got {got}")
+
+
+def check_method(key: str, value: object, method: str, example: str) -> None:
+    """Raises ``SettingError`` unless a setting is an object with a method.
+
+    A class of such objects is none.
+    """
+    if isinstance(value, type) or not hasattr(value, method):
+        got = repr(value)
+        if isinstance(value, type):
+            got = f"the class {value.__name__}"
+        elif len(got) > _LONG:
+            got = type(value).__name__
+        rule = f"must be an object with the method {method!r}, such as {example}"
+        raise SettingError(key, f"{rule}; got {got}")
+
+
+def check_indices(key: str, indices: Any, count: int) -> tuple[int, ...]:
+    """Returns a setting that is different indices, from 0 to count - 1.
+
+    Raises:
+        SettingError: It is no list of them; a mask of truth values is none.
+    """
+    is_list = isinstance(indices, Iterable) and not isinstance(indices, str)
+    given: tuple[Any, ...] = tuple(indices) if is_list else ()
+    whole = all(isinstance(i, Integral) and not isinstance(i, bool) for i in given)
+    in_range = whole and all(0 <= i < count for i in given)
+    if not (is_list and in_range and len(set(given)) == len(given)):
+        got = list(given) if is_list else indices
+        rule = f"must be a list of different indices from 0 to {count - 1}"
+        raise SettingError(key, f"{rule}; got {got!r}")
+    return tuple(int(i) for i in given)
+
+
+def check_flag(key: str, value: Any) -> None:
+    """Raises ``SettingError`` unless a setting is a truth value."""
+    if not isinstance(value, bool):
+        raise SettingError(key, f"must be true or false; got {value!r}")
 
 
 def check_choice(key: str, value: Any, choices: Sequence[str]) -> None:

@@ -269,7 +269,7 @@ def test_rows_that_are_no_table_of_numbers_are_refused(rows):
         (
             {"states": [5]},
             SettingError,
-            r"states: must be different indices from 0 to 1; got \[5\]",
+            r"states: must be a list of different indices from 0 to 1; got \[5\]",
         ),
     ],
 )

@@ -29,8 +29,15 @@ from gpmpc.gp import (
     save_posterior,
     train,
 )
+from gpmpc.learning import LearningController, OnlineLearning
 from gpmpc.logs import read_log
-from gpmpc.models import Affine, DelayedModel, ResidualModel, save_model
+from gpmpc.models import (
+    Affine,
+    DelayedModel,
+    KnownModel,
+    ResidualModel,
+    save_model,
+)
 from gpmpc.models import train as train_model
 from gpmpc.mpc import (
     GPMPC,
@@ -43,11 +50,13 @@ from gpmpc.mpc import (
     Problem,
     Reference,
     Tracking,
+    dlqr,
 )
 from gpmpc.mpc.baselines import NMPC
-from gpmpc.plotting import flight_figure
-from gpmpc.propagation import Linearization
-from gpmpc.recording import McapRecorder, RecordedSystem, read_run
+from gpmpc.plotting import calibration_figure, flight_figure, tracking_figure
+from gpmpc.propagation import Linearization, rollout
+from gpmpc.qp import DualActiveSet
+from gpmpc.recording import McapRecorder, RecordedSystem, read_run, replay
 from gpmpc.signals import Signals
 from gpmpc.simulation import Dropout, Gust, Noise, closed_loop, closed_loops
 from gpmpc.studies.flight import Experiment, run_trial
@@ -68,6 +77,18 @@ def cart_of(function):
     dynamics = Cart()
     dynamics.derivative = function
     return System(dynamics, 0.1)
+
+
+class Circular(Cart):
+    input_names = ("speed",)
+
+
+def filled(x, u):
+    """The derivative of a newcomer who fills an array."""
+    derivative = np.zeros(2)
+    derivative[0] = x[1]
+    derivative[1] = u[0]
+    return derivative
 
 
 PLANT = System(Cart(), 0.1)
@@ -355,7 +376,7 @@ MODELS = {
     ),
     "measured by name": (
         lambda: Measurement.of_states(2, ["position"], [0.1]),
-        "states: must be indices from 0 to 1",
+        "states: must be a list of different indices",
     ),
     "negative deviation": (
         lambda: Measurement.of_states(2, [0], [-0.1]),
@@ -390,7 +411,7 @@ CONTROLLERS = {
     ),
     "angle without a list": (
         lambda: Tracking([1.0, 1.0], [1.0], angles=0),
-        "angles: must be a list of indices",
+        "angles: must be a list of different indices",
     ),
     "penalized, misspelt": (
         lambda: Tracking([1.0], [1.0], penalized="input"),
@@ -698,6 +719,152 @@ FURTHER = {
         "rollout: must be a Rollout of closed_loop; got GPMPC",
     ),
 }
+OF_A_KIND = {
+    "one constraint as a function": (
+        lambda: Problem(COST, constraints=lambda x: x[:, 0] - 1),
+        "constraints: must be Box(...), Halfspaces(...) or Inequality(...); got func",
+    ),
+    "constraints by name": (
+        lambda: Problem(COST, constraints={"wall": Box([-1, -1], [1, 1])}),
+        "constraints: must be Box(...), Halfspaces(...) or Inequality(...); got dict",
+    ),
+    "the class of a constraint": (
+        lambda: Problem(COST, constraints=[Box]),
+        "constraints: must be Box(...), Halfspaces(...) or Inequality(...); got the c",
+    ),
+    "a mask in the place of indices": (
+        lambda: Tracking([1.0, 1.0], [1.0], angles=[True, False]),
+        "angles: must be a list of different indices from 0 to 1; got [True, False]",
+    ),
+    "one state without a list": (
+        lambda: Measurement.of_states(2, 0, [0.1]),
+        "states: must be a list of different indices from 0 to 1; got 0",
+    ),
+    "a state measured twice": (
+        lambda: Measurement.of_states(2, [0, 0], [0.1, 0.1]),
+        "states: must be a list of different indices from 0 to 1; got [0, 0]",
+    ),
+    "the class of a model": (
+        lambda: controller(model=Trainer),
+        "model: must be a DynamicsModel, such as GPPosterior; got the class Trainer",
+    ),
+    "a flight as the last decision": (
+        lambda: control(previous=fly()),
+        "previous: must be the last Decision, or None at the first step; got Rollout",
+    ),
+    "yes for true": (
+        lambda: Linearization(process_noise="yes"),
+        "process_noise: must be true or false; got 'yes'",
+    ),
+    "model and propagator exchanged": (
+        lambda: rollout(gp(), Linearization(), Gaussian.certain(START), torch.ones(1)),
+        "propagator: must be an object with the method 'propagate'",
+    ),
+    "an input that is a state": (
+        lambda: System(Circular(), 0.1),
+        "dynamics.input_names: must be no names of states; got 'speed'",
+    ),
+    "rate and position exchanged": (
+        lambda: System(Cart(), 0.1, rates={"position": "speed"}),
+        "rates: must map a rate to what it is the rate of, such as {'speed': 'posi",
+    ),
+    "angles as yes": (
+        lambda: System(Cart(), 0.1, angles=True),
+        "angles: must be a list of names; got True",
+    ),
+    "a unit that is a number": (
+        lambda: System(Cart(), 0.1, units={"position": 1}),
+        "units: must be texts, such as 'm'; got 1 of position",
+    ),
+    "dynamics as what is known": (
+        lambda: System(Cart(), 0.1, nominal=Cart()),
+        "nominal: must be System(dynamics, time_step); got Cart",
+    ),
+    "an array that is filled": (
+        lambda: step_many(cart_of(filled), X, U),
+        "dynamics: must be written with plain arithmetic and functions of gpmpc.syst",
+    ),
+    "a column of states and inputs": (
+        lambda: Transitions.from_csv("log.csv", ["x"], ["x"]),
+        "inputs: must be no states; got 'x'",
+    ),
+    "dt of a CSV file": (
+        lambda: Transitions.from_csv("log.csv", ["x"], ["u"], dt=0.1),
+        "dt: is no argument (did you mean 'time_step'?)",
+    ),
+    "a column by its name": (
+        lambda: data()["position"],
+        "rows: must be whole numbers or a slice; columns are in states and inputs",
+    ),
+    "a system as a known model": (
+        lambda: KnownModel(PLANT, 2, 1),
+        "function: must be a function of tensors; got System",
+    ),
+    "a known model of NumPy": (
+        lambda: KnownModel(lambda x, u: np.zeros(2), 2, 1),
+        "function must give next states (*batch, 2) of states (*batch, 2) and inputs",
+    ),
+    "a known model of one state": (
+        lambda: KnownModel(lambda x, u: torch.stack([x[0], x[1] + u[0]]), 2, 1),
+        "function must give next states (*batch, 2) of states (*batch, 2) and inputs",
+    ),
+    "a known model without numbers": (
+        lambda: KnownModel(lambda x, u: x),
+        "state_dim: is missing; KnownModel takes function, state_dim, input_dim",
+    ),
+    "the class of a disturbance": (
+        lambda: fly(disturbances=[Gust]),
+        "disturbances: must be an object with the method 'disturb_plant'",
+    ),
+    "a function as disturbance": (
+        lambda: fly(disturbances=[lambda time: 0.0]),
+        "disturbances: must be an object with the method 'disturb_plant'",
+    ),
+    "learning in a dictionary": (
+        lambda: LearningController(controller(), {"points": 10}),
+        "learning: must be OnlineLearning(...); got dict",
+    ),
+    "a share in per cent": (
+        lambda: OnlineLearning(share=10),
+        "share: must be at most 1; got 10",
+    ),
+    "a flight as a recording": (
+        lambda: tracking_figure(fly()),
+        "run: must be a Run of read_run; got Rollout",
+    ),
+    "a path as a recording": (
+        lambda: replay("run.mcap", 1),
+        "run: must be a Run of read_run; got str",
+    ),
+    "a figure without its system": (
+        lambda: flight_figure(fly()),
+        "system: is missing; flight_figure takes rollout, system",
+    ),
+    "a recording of nothing": (
+        lambda: read_run(None),
+        "path: must be the name of one file; got None",
+    ),
+    "a flight as a calibration": (
+        lambda: calibration_figure(fly()),
+        "calibration: must be what calibrate returns; got Rollout",
+    ),
+    "an experiment in another order": (
+        lambda: Experiment(pendulum(), RandomData(), None, Trainer(), controller),
+        "system: must be a System; got NoneType",
+    ),
+    "weights as a diagonal for a gain": (
+        lambda: dlqr([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]], [1.0, 1.0], [1.0]),
+        "A, B, Q and R must be (n, n), (n, m), (n, n) and (m, m); got (2, 2), (2, 1)",
+    ),
+    "a tolerance in words": (
+        lambda: DualActiveSet(tolerance="tight"),
+        "tolerance must be positive; got tight",
+    ),
+    "a program in pieces": (
+        lambda: DualActiveSet().solve(np.eye(2), np.zeros(2)),
+        "problem must be QuadraticProgram(...); got ndarray",
+    ),
+}
 ROOMS = {
     "systems": SYSTEMS,
     "data": DATA,
@@ -706,6 +873,7 @@ ROOMS = {
     "loops": LOOPS,
     "studies": STUDIES,
     "further": FURTHER,
+    "of a kind": OF_A_KIND,
 }
 CALLS = {
     f"{room}: {name}": row for room, rows in ROOMS.items() for name, row in rows.items()
@@ -719,6 +887,7 @@ COMMANDS = {
     "run --horizon 5": "unknown option '--horizon'",
     "run -m seed=range(3": "'seed=range(3': cannot be read",
     "run model=nothere.safetensors": "nothere.safetensors: no such file",
+    "run noise=0.1": "noise: must be set by its parts, as noise.NAME=VALUE; got 0.1",
     "run folder=": "folder: must be the path of a folder",
     "plot": "the following arguments are required: RUN",
     "plot log.csv": "log.csv: is not an MCAP file",

@@ -24,6 +24,17 @@ from gpmpc.studies.flight import Experiment
 from gpmpc.systems import System
 
 _NEEDED_GROUPS = ("data", "trajectory", "system", "model", "controller")
+_SECTIONS = (  # settings that have settings
+    *_NEEDED_GROUPS,
+    "controller.problem",
+    "controller.problem.cost",
+    "controller.problem.inputs",
+    "controller.problem.input_rates",
+    "controller.prediction",
+    "noise",
+    "plant",
+    "nominal",
+)
 # Settings that no object takes, and their values.
 _CHOICES = {
     "recorder": ("mcap", "none"),
@@ -98,7 +109,8 @@ def _build(config: DictConfig) -> Experiment:
         raise SettingError(
             "nominal", "needs model=difference_gp, which learns what it misses"
         )
-    noise = Noise(**config.noise) if any(config.noise.values()) else None
+    has_noise = config.noise and any(config.noise.values())
+    noise = Noise(**config.noise) if has_noise else None
     learning = None
     if config.get("learning"):
         learning = instantiate(config.learning, _convert_="all")
@@ -162,6 +174,16 @@ def _system_of(settings: Any) -> System:
     return system
 
 
+def _check_sections(config: DictConfig) -> None:
+    """Raises where one value stands in the place of a section's settings."""
+    for key in _SECTIONS:
+        section = OmegaConf.select(config, key)
+        if section is None or OmegaConf.is_dict(section):
+            continue
+        rule = f"must be set by its parts, as {key}.NAME=VALUE"
+        raise SettingError(key, f"{rule}; got {section!r}")
+
+
 def _check(config: DictConfig) -> None:
     """Raises where a setting that no object takes is none of its choices.
 
@@ -186,6 +208,7 @@ def _check(config: DictConfig) -> None:
     for group in _NEEDED_GROUPS:
         if not config.get(group):
             raise SettingError(group, "choose one")
+    _check_sections(config)
     if len(config.trajectory) != 1:
         raise SettingError(
             "trajectory", f"choose one; got {', '.join(config.trajectory)}"

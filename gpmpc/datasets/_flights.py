@@ -19,6 +19,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import DataError, SettingError, check_number, check_numbers
 from gpmpc.gp import Transitions
 from gpmpc.mpc import problem as mpc
@@ -113,6 +114,7 @@ class Tracking:
         return closed_loop(self.plant, controller, references, at_rest, steps)
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class NMPCData:
     """Transitions of unconstrained NMPC on the true plant."""
@@ -174,6 +176,7 @@ class NMPCData:
         return self.rotational.fly(references, self.horizon, self.samples)
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class PaperData:
     """The authors' published files, ``ds_nmpc_<Trajectory>_<trans|rotate>.txt``."""
@@ -226,6 +229,7 @@ def _attitudes(flight: Rollout, convention: str) -> np.ndarray:
     return attitude_for_thrust_direction(ux, uy, convention=convention)
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Excitation:
     """A flight of one subsystem for data.
@@ -273,6 +277,7 @@ class Excitation:
         )
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class ExcitedData:
     """Transitions of dithered flights, to train models that fly.

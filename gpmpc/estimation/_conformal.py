@@ -41,6 +41,7 @@ import torch
 from scipy.stats import beta
 
 from gpmpc._angles import angles_of, full_turns, state_difference
+from gpmpc._calls import explains_arguments
 from gpmpc._compiled import compiled
 from gpmpc._dynamics import Array, DynamicsModel, to_array
 from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
@@ -48,6 +49,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import Propagator, rollout
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class ConformalTube:
     """Scores of held-out predictions, and the standard deviations that follow.
@@ -152,6 +154,7 @@ class ConformalTube:
         return self.scores[rank - 1].copy()
 
 
+@explains_arguments
 class AdaptiveTube:
     """Adapts the standard deviations of each stage to how often predictions hold.
 

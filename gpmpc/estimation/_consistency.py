@@ -17,6 +17,7 @@ from scipy.stats import chi2
 from torch import Tensor
 
 from gpmpc._angles import state_difference
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import DataError, ShapeError
 from gpmpc.gaussian import Gaussian
 
@@ -48,6 +49,7 @@ class Consistency:
         return self.band[0] <= self.mean <= self.band[1]
 
 
+@explains_arguments
 def normalized_errors(
     errors: Any, covariances: Any, level: float = 0.95, independent: int | None = None
 ) -> Consistency:
@@ -107,6 +109,7 @@ def normalized_errors(
     return Consistency(values=values, degrees=degrees, band=(float(low), float(high)))
 
 
+@explains_arguments
 def estimation_errors(belief: Gaussian, states: Any, angles: Any = ()) -> Tensor:
     """Computes the errors x - mu (..., n) of beliefs; of angles, within half a turn.
 
@@ -124,6 +127,7 @@ def estimation_errors(belief: Gaussian, states: Any, angles: Any = ()) -> Tensor
     return state_difference(truth, belief.mean, angles)
 
 
+@explains_arguments
 def autocorrelation(
     innovations: Any, covariances: Any, lag: int = 1
 ) -> tuple[float, float]:

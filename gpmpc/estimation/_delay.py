@@ -25,8 +25,14 @@ from typing import Any
 import numpy as np
 
 from gpmpc._angles import wrap
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
-from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
+from gpmpc.exceptions import (
+    DataError,
+    ShapeError,
+    check_indices,
+    check_number,
+)
 
 # Part of a square that a regression leaves, below which it leaves nothing.
 _DEPENDENT = 1e-8
@@ -48,6 +54,7 @@ class DelayEstimate:
     correlations: Array  #: of each (T,), from 0 to 1
 
 
+@explains_arguments
 def estimate_delay(
     states: Any,
     inputs: Any,
@@ -196,12 +203,7 @@ def _block_grams(
 
 def _without_jumps(states: Array, angles: Sequence[int]) -> Array:
     """Counts the turns of angles in states (T + 1, n) from the first row on."""
-    places = list(angles)
-    if any(not 0 <= i < states.shape[1] for i in places):
-        raise SettingError(
-            "angles",
-            f"must be indices of {states.shape[1]} states from 0 on; got {places}",
-        )
+    places = list(check_indices("angles", angles, states.shape[1]))
     counted = states.copy()
     changes = wrap(np.diff(states[:, places], axis=0))
     counted[1:, places] = states[0, places] + np.cumsum(changes, axis=0)

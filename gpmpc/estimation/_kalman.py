@@ -20,7 +20,6 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
-from numbers import Integral
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -49,6 +48,7 @@ from gpmpc.estimation._conditioning import (
 from gpmpc.exceptions import (
     SettingError,
     ShapeError,
+    check_indices,
     check_kind,
     check_number,
     check_numbers,
@@ -100,13 +100,10 @@ class Measurement(TensorModel):
             raise SettingError(
                 "function", f"must be a function of the state; got {self.function!r}"
             )
-        if any(not 0 <= i < len(R) for i in self.angles):
-            raise SettingError(
-                "angles",
-                f"must be entries of y from 0 to {len(R) - 1}; got {list(self.angles)}",
-            )
+        check_indices("angles", self.angles, len(R))
 
     @classmethod
+    @explains_arguments
     def of_states(
         cls,
         state_dim: int,
@@ -126,14 +123,9 @@ class Measurement(TensorModel):
         Raises:
             SettingError: A state is out of range, or a standard deviation is negative.
         """
-        are_indices = all(
-            isinstance(i, Integral) and 0 <= i < state_dim for i in states
-        )
-        if not (are_indices and len(states)):
-            raise SettingError(
-                "states",
-                f"must be indices from 0 to {state_dim - 1}; got {list(states)}",
-            )
+        states = check_indices("states", states, state_dim)
+        if not states:
+            raise SettingError("states", "must name a state; got none")
         check_numbers("std", std, len(states), least=0)
         R = torch.diag(torch.tensor(list(std), dtype=torch.float64) ** 2)
         return cls(
@@ -419,6 +411,7 @@ class _View(NamedTuple):
     linearization_error: Tensor  # Cov[y] - Y Y' (*batch, p, p)
 
 
+@explains_arguments
 def smooth(run: FilterRun) -> Gaussian:
     """Computes the beliefs given the whole log (T + 1, n).
 
@@ -447,6 +440,7 @@ def smooth(run: FilterRun) -> Gaussian:
     return _stacked(beliefs[::-1])
 
 
+@explains_arguments
 class LateMeasurements:
     """A filter in a loop whose measurements may come late.
 

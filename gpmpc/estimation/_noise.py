@@ -42,6 +42,7 @@ import torch
 from torch import Tensor
 
 from gpmpc._angles import angles_of, state_difference
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import DataError, ShapeError, UnsupportedModel, check_number
 from gpmpc.gp import (
@@ -90,6 +91,7 @@ class ProcessNoise:
         return self.variance * (1 + rho) / (1 - rho)
 
 
+@explains_arguments
 def estimate_process_noise(
     model: Any, transitions: Transitions, block: int = 20
 ) -> ProcessNoise:
@@ -148,6 +150,7 @@ def follows_previous(model: Any, transitions: Transitions) -> Tensor:
     return gap <= 1e-12 + 1e-9 * now.abs().amax(1)
 
 
+@explains_arguments
 def with_process_noise(
     posterior: GPPosterior, noise: ProcessNoise | Tensor
 ) -> GPPosterior:
@@ -287,6 +290,7 @@ class VaryingNoise:
     error: Tensor  #: standard error of the gain, over blocks of time (k,) [nats]
 
 
+@explains_arguments
 def estimate_varying_noise(
     model: DynamicsModel, transitions: Transitions, block: int = 20, seed: int = 0
 ) -> VaryingNoise:

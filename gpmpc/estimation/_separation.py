@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, DynamicsModel, linearize, to_array
 from gpmpc.estimation._noise import follows_previous, residuals
 from gpmpc.exceptions import DataError, UnsupportedModel
@@ -43,6 +44,7 @@ class SeparatedNoise:
     measurement: Tensor
 
 
+@explains_arguments
 def separate_noise(
     model: GPPosterior | ResidualModel, transitions: Transitions, block: int = 20
 ) -> SeparatedNoise:

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from gpmpc._calls import explains_arguments
 from gpmpc._files import write_whole
 from gpmpc.exceptions import check_choice
 from gpmpc.export._checks import check_exportable
@@ -36,6 +37,7 @@ class Export(NamedTuple):
     source: Path
 
 
+@explains_arguments
 def export_c(
     controller: GPMPC,
     path: str | Path,

@@ -14,6 +14,7 @@ import torch
 from gpytorch.constraints import Positive
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import ShapeError, UnsupportedModel
 from gpmpc.gp._gpytorch_checks import (
     ExactModel,
@@ -73,6 +74,7 @@ class BatchExactGP(gpytorch.models.ExactGP):
             self.likelihood.noise_covar.raw_noise.copy_(2 * log_noise)
 
 
+@explains_arguments
 def to_gpytorch(posterior: GPPosterior) -> BatchExactGP:
     """Builds the GPyTorch model of a posterior.
 
@@ -94,6 +96,7 @@ def to_gpytorch(posterior: GPPosterior) -> BatchExactGP:
     return model.eval()
 
 
+@explains_arguments
 def from_gpytorch(
     model: Any,
     likelihood: Any = None,

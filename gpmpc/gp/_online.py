@@ -29,6 +29,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._kernels._window import drop_point
 from gpmpc.exceptions import (
     DataError,
@@ -50,6 +51,7 @@ _log = logging.getLogger(__name__)
 _LARGE_PART = 0.2
 
 
+@explains_arguments
 def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPosterior:
     """Appends transitions to a posterior's data.
 
@@ -77,6 +79,7 @@ def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPo
     return append_points(posterior, transitions.features, targets)
 
 
+@explains_arguments
 def append_points(
     posterior: GPPosterior, features: Tensor, targets: Tensor
 ) -> GPPosterior:
@@ -161,6 +164,7 @@ def _checked_points(
     return features, targets
 
 
+@explains_arguments
 def remove_points(
     posterior: GPPosterior, indices: Sequence[int] | Tensor
 ) -> GPPosterior:
@@ -233,6 +237,7 @@ def targets_of(posterior: GPPosterior, transitions: Transitions) -> Tensor:
     return transitions.targets(posterior.predicts)
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class SlidingWindow:
     """Appends points to a posterior and removes others that exceed a given number.

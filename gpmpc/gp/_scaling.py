@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import check_tensors
 
@@ -81,6 +82,7 @@ def centre(columns: Tensor, names: Sequence[str] = ()) -> Scaling:
     return Scaling(offset=mean, factor=torch.ones_like(mean))
 
 
+@explains_arguments
 def standardize(
     columns: Tensor, names: Sequence[str], resolution: float = 0.0
 ) -> Scaling:

@@ -22,6 +22,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.optimize import minimize
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gp._data_checks import column_std
 from gpmpc.gp._kernel import IGNORED
@@ -50,6 +51,7 @@ _LOG_INTERVAL = 5.0  # [s]
 Penalty = Callable[[np.ndarray, np.ndarray], tuple[float, np.ndarray]]
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class SoftLimits:
     """Soft walls around length-scales and signal-to-noise ratio.

@@ -338,6 +338,7 @@ def _noise_alone(targets: Tensor) -> np.ndarray:
     return (len(targets) / 2 * (2 * math.pi * math.e * variance).log()).numpy()
 
 
+@explains_arguments
 def informative_points(
     features: Tensor, hyperparameters: Sequence[Tensor], count: int
 ) -> list[int]:

@@ -33,6 +33,7 @@ import safetensors.numpy
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._files import existing_file, new_file, write_whole
 from gpmpc._provenance import now, versions
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
@@ -58,6 +59,7 @@ _POSTERIOR_TENSORS = (
 _EXPANSION = 20  # times what a file holds: more than numbers shrink by
 
 
+@explains_arguments
 def save_posterior(
     posterior: GPPosterior, path: str | Path, metadata: Mapping[str, Any] | None = None
 ) -> None:
@@ -86,6 +88,7 @@ def save_posterior(
     write_model(path, "GPPosterior", header, tensors, metadata)
 
 
+@explains_arguments
 def load_posterior(path: str | Path) -> GPPosterior:
     """Reads a file of ``save_posterior``, into host memory.
 
@@ -100,6 +103,7 @@ def load_posterior(path: str | Path) -> GPPosterior:
     return posterior_of_parts(path, header, tensors)
 
 
+@explains_arguments
 def load_metadata(path: str | Path) -> dict[str, Any]:
     """Reads the header of a model file.
 

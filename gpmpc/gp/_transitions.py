@@ -140,6 +140,9 @@ class Transitions:
 
     def __getitem__(self, rows: slice | Sequence[int]) -> "Transitions":
         """Returns the transitions of some rows, in their order."""
+        if isinstance(rows, str):
+            rule = "must be whole numbers or a slice; columns are in states and inputs"
+            raise SettingError("rows", f"{rule}; got {rows!r}")
         return Transitions(
             self.states[rows], self.inputs[rows], self.next_states[rows], self.signals
         )
@@ -205,6 +208,7 @@ class Transitions:
         )
 
     @classmethod
+    @explains_arguments
     def from_csv(
         cls,
         path: str | Path,
@@ -241,6 +245,9 @@ class Transitions:
         next_names = list(next_states or states)
         header, lines = _csv_lines(path)
         columns = [*states, *inputs, *next_names]
+        for name in inputs:
+            if name in states:
+                raise SettingError("inputs", f"must be no states; got {name!r}")
         _check_header(path, header, columns)
         places = {name: header.index(name) for name in columns}
         table = _table(path, lines, places, len(header), least=2 if is_recording else 1)

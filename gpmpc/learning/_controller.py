@@ -8,14 +8,14 @@ import numpy as np
 
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, to_array
-from gpmpc.exceptions import DataError, SettingError
+from gpmpc.exceptions import DataError, SettingError, check_kind, check_method
 from gpmpc.gaussian import Gaussian
 from gpmpc.learning._changed_model import ChangedModel
 from gpmpc.learning._settings import OnlineLearning
 from gpmpc.learning._state import LearningState
 from gpmpc.learning._step import learn_from_step
 from gpmpc.mpc import Decision, Reference
-from gpmpc.mpc._controller import check_arguments, check_method
+from gpmpc.mpc._controller import check_arguments
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.status import Status
 
@@ -34,8 +34,11 @@ class LearningController:
 
     def __init__(self, controller: GPMPC, learning: OnlineLearning | None = None):
         check_method("controller", controller, "with_model", "GPMPC(...)")
+        if learning is None:
+            learning = OnlineLearning()
+        check_kind("learning", learning, OnlineLearning, "OnlineLearning(...)")
         self.controller = controller
-        self.learning = OnlineLearning() if learning is None else learning
+        self.learning = learning
         self.problem = controller.problem
         self.horizon = controller.horizon
         self.initial_input = controller.initial_input

@@ -5,12 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import check_number
 from gpmpc.gp import Transitions
 from gpmpc.signals import Signals
 from gpmpc.simulation import Rollout
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class EpisodicLearning:
     """Learns from one flight to the next: its transitions join the data of a new model.

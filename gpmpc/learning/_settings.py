@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gpmpc._calls import explains_arguments
-from gpmpc.exceptions import check_number
+from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gp import SlidingWindow
 
 
@@ -36,4 +36,6 @@ class OnlineLearning:
         check_number("window", self.window, least=1, whole=True)
         for key in ("share", "memory", "surprise"):
             check_number(key, getattr(self, key), above=0)
+        if self.share > 1:
+            raise SettingError("share", f"must be at most 1; got {self.share}")
         check_number("margin", self.margin, least=0)

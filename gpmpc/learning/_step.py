@@ -10,6 +10,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from gpmpc._angles import state_difference
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
 from gpmpc.learning._changed_model import ChangedModel, Comparison
 from gpmpc.learning._innovation import LARGEST_LEAD, Innovation, LearningStep
@@ -23,6 +24,7 @@ _MISALIGNED = 0.1  # part of errors that no input explains, in deviations, at mo
 _PATIENCE = 2  # further confirmations for steps that nothing explained, at most
 
 
+@explains_arguments
 def learn_from_step(
     learning: LearningState, input: Array, measured: Array
 ) -> LearningState:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import (
     DataError,
@@ -55,6 +56,7 @@ class NominalFit:
         return [row for row in rows if row[0]]
 
 
+@explains_arguments
 def fit_nominal(
     model: LogModel, theta0: Array | None, log: Log, steps: int = STEPS
 ) -> NominalFit:

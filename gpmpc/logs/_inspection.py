@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError, SettingError, check_kind, check_number
 from gpmpc.logs._channel_figures import (
@@ -136,6 +137,7 @@ class _Reading(NamedTuple):
     dependence: dict[str, float]  # by input; see ``Inspection.follows``
 
 
+@explains_arguments
 def inspect_log(
     path: str | Path,
     mapping: LogMapping | None = None,

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import ndtri
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError, SettingError, check_kind, check_number
 from gpmpc.logs._baselines import baseline_errors
@@ -112,6 +113,7 @@ class Judgement:
         return pd.DataFrame(rows)
 
 
+@explains_arguments
 def judge(
     learned: IdentifiedModel, held_out: Log, train: Log, steps: Sequence[int] = STEPS
 ) -> Judgement:

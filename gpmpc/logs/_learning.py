@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import SettingError, check_kind, check_number
 from gpmpc.gp._wrapped import warn_of_turns
@@ -59,6 +60,7 @@ class IdentifiedModel:
     namings: Namings = NO_NAMINGS
 
 
+@explains_arguments
 def learn(
     log: Log,
     points: int = 300,

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gpmpc._bounds import MemoryBudget
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import DataError, check_kind
 from gpmpc.logs._columns import check_column, named_columns, runs_side_by_side
 from gpmpc.logs._conventions import read_rigid_bodies
@@ -26,6 +27,7 @@ MOST_RUNS = 100  # in a file, unless each has
 FEWEST_ROWS = 10
 
 
+@explains_arguments
 def read_log(
     files: str | Path | Sequence[str | Path],
     mapping: LogMapping | Mapping[str, Any] | str | Path,

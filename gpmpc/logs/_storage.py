@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel
 from gpmpc._files import existing_file, new_file
 from gpmpc._trust import trusted_packages
@@ -39,6 +40,7 @@ from gpmpc.signals import UNKNOWN, Signals, signals_of
 from gpmpc.systems import System
 
 
+@explains_arguments
 def save_learned(learned: IdentifiedModel, path: str | Path) -> None:
     """Writes what was learned from a log, in one piece or not at all.
 
@@ -79,6 +81,7 @@ def save_learned(learned: IdentifiedModel, path: str | Path) -> None:
     write_model(path, LOG_MODEL, header, tensors)
 
 
+@explains_arguments
 def load_learned(path: str | Path, trusted: Sequence[str] = ()) -> IdentifiedModel:
     """Reads a file of ``save_learned``.
 
@@ -205,6 +208,7 @@ def _are_called(own: Sequence[str], namings: Sequence[Sequence[str]]) -> bool:
     return order_by_name(own, namings) == list(range(len(own)))
 
 
+@explains_arguments
 def load_flyable(path: str | Path, trusted: Sequence[str] | None = None) -> SavedModel:
     """Reads a model of any file, of ``gpmpc learn`` or of ``save_model``.
 

@@ -7,10 +7,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, to_array
 from gpmpc.exceptions import UnsupportedModel
 
 
+@explains_arguments
 class CasadiFunction:
     """A function that is written in CasADi, linearised at all points in one call.
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, check_next_states, to_array
 from gpmpc.exceptions import SettingError, ShapeError, check_numbers
 from gpmpc.gaussian import Gaussian, check_tensors
@@ -17,6 +18,7 @@ from gpmpc.models._wrapper import LinearPart, LinearWrapper
 from gpmpc.signals import signals_of
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class DisturbedModel(LinearWrapper):
     """A model with disturbances as further states (x, d) that a filter estimates.

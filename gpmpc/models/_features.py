@@ -12,10 +12,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import SettingError, check_indices
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Features:
     """A map from a state and an input to the features of a GP.
@@ -47,9 +49,9 @@ class Features:
     input_dim: int  #: m
 
     def __post_init__(self) -> None:
-        _check_indices("states", self.states, self.state_dim)
-        _check_indices("inputs", self.inputs, self.input_dim)
-        _check_indices("angles", self.angles, self.state_dim)
+        check_indices("states", self.states, self.state_dim)
+        check_indices("inputs", self.inputs, self.input_dim)
+        check_indices("angles", self.angles, self.state_dim)
         if not set(self.angles) <= set(self.states):
             rule = f"must be some of the selected states {list(self.states)}"
             raise SettingError("angles", f"{rule}; got {self.angles}")
@@ -150,14 +152,3 @@ class Features:
         by_input = np.zeros((*by_inputs.shape[:-1], self.input_dim))
         by_input[..., self._input_columns] = by_inputs
         return by_state, by_input
-
-
-def _check_indices(key: str, indices: Sequence[int], count: int) -> None:
-    """Raises ``SettingError`` unless indices are different, from 0 to count - 1."""
-    are_integers = all(isinstance(i, int) and not isinstance(i, bool) for i in indices)
-    if are_integers:
-        in_range = all(0 <= i < count for i in indices)
-        if in_range and len(set(indices)) == len(indices):
-            return
-    rule = f"must be different indices from 0 to {count - 1}"
-    raise SettingError(key, f"{rule}; got {list(indices)}")

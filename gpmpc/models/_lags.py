@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gpmpc._arrays import names_of, read_array
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.gp import Transitions
@@ -16,6 +17,7 @@ from gpmpc.models._nominal import Affine
 from gpmpc.signals import Signals
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Lags:
     """The state (x_k, x_{k-1}, .., x_{k-p}, u_{k-1}, .., u_{k-q}) of such a model.

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import (
     Array,
     DynamicsModel,
@@ -23,6 +24,7 @@ from gpmpc.models._tensors import check_like, move
 from gpmpc.models._wrapper import Wrapper
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class NoisyModel(Wrapper):
     """A model whose predictions contain its noise, a GP on its logarithm.

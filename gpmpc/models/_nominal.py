@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import (
     Array,
     Linearized,
@@ -18,11 +19,12 @@ from gpmpc._dynamics import (
     to_array,
 )
 from gpmpc._functions import call
-from gpmpc.exceptions import ShapeError
+from gpmpc.exceptions import GpmpcError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.signals import UNKNOWN, Signals
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Affine:
     """A nominal model x+ = A x + B u + c, through which uncertainty goes exactly.
@@ -89,9 +91,14 @@ class Affine:
         return to_array(self.A), to_array(self.B), to_array(self.c)
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class KnownModel:
     """A known function x+ = f0(x, u) as a model without uncertainty.
+
+    Raises:
+        SettingError: A number is no whole one, or the function fails at zero.
+        ShapeError: It does not give next states of a batch.
 
     >>> import torch
     >>> model = KnownModel(lambda x, u: 0.9 * x + u, state_dim=1, input_dim=1)
@@ -112,6 +119,36 @@ class KnownModel:
 
     dtype = torch.float64
     device = torch.device("cpu")
+
+    def __post_init__(self) -> None:
+        check_number("state_dim", self.state_dim, least=1, whole=True)
+        check_number("input_dim", self.input_dim, least=0, whole=True)
+        self._check_function()
+
+    def _check_function(self) -> None:
+        """Raises unless the function gives next states of a batch of states."""
+        n = self.state_dim
+        m = self.input_dim
+        rows = n + m + 1  # more than columns: a function of one state shows
+        states = torch.zeros(rows, n, dtype=self.dtype)
+        inputs = torch.zeros(rows, m, dtype=self.dtype)
+        rule = f"must give next states (*batch, {n}) of states (*batch, {n}) and inputs"
+        try:
+            with torch.no_grad():
+                value = call("function", self.function, states, inputs)
+        except GpmpcError:
+            raise
+        except Exception as error:
+            got = f"{type(error).__name__}: {error}".partition("\n")[0]
+            raise SettingError(
+                "function", f"{rule} (*batch, {m}); got {got}"
+            ) from error
+        shape = tuple(value.shape) if isinstance(value, Tensor) else type(value)
+        if shape != (rows, n):
+            got = shape if isinstance(shape, tuple) else shape.__name__
+            raise ShapeError(
+                f"function {rule} (*batch, {m}); got {got} of {rows} states"
+            )
 
     @property
     def tape(self) -> Any:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, DynamicsModel, linearize, to_array
 from gpmpc._kernels import GPArrays
 from gpmpc._kernels.gp_rollout import (
@@ -44,6 +45,7 @@ def iterate(step: Callable[[int, Array], Array], start: Array, steps: int) -> Ar
     return states
 
 
+@explains_arguments
 class RollOut:
     """Rollouts of the mean of one model of next states, from any number of starts.
 

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel
 from gpmpc._files import existing_file, new_file
 from gpmpc._trust import trusted_packages
@@ -55,6 +56,7 @@ _DEEPEST = 16  # models inside each other; three are many
 _MOST = 2048  # states, and inputs, of a model from a file: a matrix of theirs is 32 MB
 
 
+@explains_arguments
 def save_model(
     model: Any, path: str | Path, metadata: Mapping[str, Any] | None = None
 ) -> None:
@@ -85,6 +87,7 @@ def save_model(
     write_model(path, header.pop("kind"), header, tensors, metadata)
 
 
+@explains_arguments
 def load_model(path: str | Path, trusted: Sequence[str] = ()) -> Any:
     """Reads a model from a file into host memory.
 

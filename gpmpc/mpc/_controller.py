@@ -20,6 +20,7 @@ from gpmpc.exceptions import (
     DataError,
     SettingError,
     ShapeError,
+    check_kind,
     check_number,
     check_numbers,
 )
@@ -380,9 +381,9 @@ class Request(NamedTuple):
             DataError: Likewise.
         """
         check_arguments(belief, reference)
-        if not (previous is None or isinstance(previous, Decision)):
-            rule = "must be the last Decision, or None at the first step"
-            raise SettingError("previous", f"{rule}; got {previous!r}")
+        if previous is not None:
+            rule = "the last Decision, or None at the first step"
+            check_kind("previous", previous, Decision, rule)
         if belief.names:
             belief = belief.in_order(signals.state_names)
         if reference.signals is not UNKNOWN:
@@ -527,24 +528,6 @@ def check_arguments(belief: Any, reference: Any) -> None:
             "and a Reference(states); "
             f"got {type(belief).__name__} and {type(reference).__name__}"
         )
-
-
-_LONG = 40  # characters of a value that a message still quotes
-
-
-def check_method(key: str, value: object, method: str, example: str) -> None:
-    """Raises ``SettingError`` unless a setting is an object with a method.
-
-    A class of such objects is none.
-    """
-    if isinstance(value, type) or not hasattr(value, method):
-        got = repr(value)
-        if isinstance(value, type):
-            got = f"the class {value.__name__}"
-        elif len(got) > _LONG:
-            got = type(value).__name__
-        rule = f"must be an object with the method {method!r}, such as {example}"
-        raise SettingError(key, f"{rule}; got {got}")
 
 
 def check_controller(

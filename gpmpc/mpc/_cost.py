@@ -6,7 +6,7 @@ Z = [J, e]' W [J, e] and e = y(z') - J z' - c.
 """
 
 import inspect
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -19,7 +19,13 @@ from gpmpc._angles import state_difference
 from gpmpc._arrays import read_array
 from gpmpc._calls import explains_arguments
 from gpmpc._functions import call
-from gpmpc.exceptions import DataError, SettingError, ShapeError, check_choice
+from gpmpc.exceptions import (
+    DataError,
+    SettingError,
+    ShapeError,
+    check_choice,
+    check_indices,
+)
 from gpmpc.models._casadi_function import CasadiFunction
 from gpmpc.models._nominal import linearize_function
 
@@ -83,7 +89,7 @@ class Tracking:
             raise SettingError("terminal", f"{rule}; got {len(terminal)}")
         check_choice("penalized", self.penalized, PENALIZED)
         if self.angles is not None:
-            angles = _read_indices("angles", self.angles, n)
+            angles = check_indices("angles", self.angles, n)
             object.__setattr__(self, "angles", angles)
         object.__setattr__(self, "Q", Q)
         object.__setattr__(self, "R", R)
@@ -395,21 +401,6 @@ def _count_arguments(function: Any) -> tuple[int, int]:
     takes_any = any(p.kind is p.VAR_POSITIONAL for p in parameters)
     most = 3 if takes_any else len(positional)
     return sum(p.default is p.empty for p in positional), most
-
-
-def _read_indices(key: str, indices: Any, n: int) -> tuple[int, ...]:
-    """Returns indices of n states.
-
-    Raises:
-        SettingError: They are no list of whole numbers from 0 to n - 1.
-    """
-    is_list = isinstance(indices, Iterable) and not isinstance(indices, str)
-    read: tuple[Any, ...] = tuple(indices) if is_list else ()
-    are_whole = all(isinstance(one, int | np.integer) for one in read)
-    if not (is_list and are_whole and all(0 <= one < n for one in read)):
-        rule = f"must be a list of indices of {n} states"
-        raise SettingError(key, f"{rule}; got {indices!r}")
-    return tuple(int(one) for one in read)
 
 
 def _weight(key: str, value: Any) -> Array:

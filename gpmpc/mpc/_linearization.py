@@ -43,12 +43,18 @@ from gpmpc._dynamics import (
     to_array,
 )
 from gpmpc._kernels.linalg import copy_matrix, dot, product
-from gpmpc.exceptions import SettingError, check_choice, check_number
+from gpmpc.exceptions import (
+    SettingError,
+    check_choice,
+    check_flag,
+    check_method,
+    check_number,
+)
 from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
 from gpmpc.models import RollOut
 from gpmpc.models._past import weighed_dim, weighed_signals
 from gpmpc.mpc._constraints import ConstraintRows, largest_violation
-from gpmpc.mpc._controller import Decision, Request, check_controller, check_method
+from gpmpc.mpc._controller import Decision, Request, check_controller
 from gpmpc.mpc._cost import PENALIZED, by_stage
 from gpmpc.mpc._linear_quadratic import (
     COVARIANCES,
@@ -113,9 +119,7 @@ class PredictionSettings:
         check_choice("form", self.form, FORMS)
         check_choice("covariance", self.covariance, COVARIANCES)
         for key in ("feedback", "rolled_out"):
-            value = getattr(self, key)
-            if not isinstance(value, bool):
-                raise SettingError(key, f"must be true or false; got {value!r}")
+            check_flag(key, getattr(self, key))
         if self.rolled_out and self.is_held:
             rule = "is for plans of form 'trajectory'"
             raise SettingError("rolled_out", f"{rule}; got form 'velocity'")

@@ -32,6 +32,7 @@ from gpmpc.exceptions import (
     ShapeError,
     SolverFailure,
     check_choice,
+    check_method,
     check_number,
 )
 from gpmpc.gaussian import Gaussian
@@ -40,7 +41,6 @@ from gpmpc.mpc._controller import (
     Decision,
     Reference,
     Timing,
-    check_method,
     one_step_on,
     read_reference,
 )

@@ -11,8 +11,12 @@ keeps P positive semidefinite whatever is rounded):
 R is positive definite, so that every step exists whatever A and B are.
 """
 
+from typing import Any
+
 import numpy as np
 
+from gpmpc._arrays import read_array
+from gpmpc._calls import explains_arguments
 from gpmpc._compiled import compiled, njit_noalloc
 from gpmpc._kernels.linalg import (
     add_transposed_product,
@@ -21,7 +25,7 @@ from gpmpc._kernels.linalg import (
     product,
     solve_positive,
 )
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.mpc._linear_quadratic import DEVIATIONS, INCREMENTS, add_blocks
 
 Array = np.ndarray
@@ -165,6 +169,30 @@ def _add_square(Z, target, W, p):
         W[e, row] += constant
 
 
+def _square_system(*matrices: Any) -> list[Array]:
+    """Returns A (n, n), B (n, m), Q (n, n) and R (m, m) as arrays.
+
+    Raises:
+        ShapeError: They are of other shapes.
+        DataError: They are no numbers.
+    """
+    names = ("A", "B", "Q", "R")
+    arrays = [
+        np.ascontiguousarray(read_array(name, matrix))
+        for name, matrix in zip(names, matrices, strict=True)
+    ]
+    n = len(np.atleast_1d(arrays[0]))
+    m = np.shape(np.atleast_2d(arrays[1]))[-1]
+    shapes = [array.shape for array in arrays]
+    if shapes != [(n, n), (n, m), (n, n), (m, m)]:
+        got = ", ".join(map(str, shapes))
+        raise ShapeError(
+            f"A, B, Q and R must be (n, n), (n, m), (n, n) and (m, m); got {got}"
+        )
+    return arrays
+
+
+@explains_arguments
 def dlqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
     """Returns the stationary gain K (m, n) of the regulator u = -K x.
 
@@ -178,6 +206,7 @@ def dlqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
 
     Raises:
         SettingError: The inputs do not reach a mode that grows.
+        ShapeError: The matrices do not belong together.
 
     >>> import numpy as np
     >>> gain = dlqr(np.array([[1.0]]), np.array([[1.0]]), np.eye(1), np.eye(1))
@@ -187,7 +216,7 @@ def dlqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
     See Also:
         ``Stability``, which says what a loop does near its rest.
     """
-    A, B, Q, R = (np.ascontiguousarray(matrix, dtype=float) for matrix in (A, B, Q, R))
+    A, B, Q, R = _square_system(A, B, Q, R)
     gains, _ = finite_horizon_lqr(A[None], B[None], Q[None], R[None], Q, _LONGEST)
     K = gains[0]
     finite = np.isfinite(K).all()

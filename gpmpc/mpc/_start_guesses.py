@@ -8,7 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc._calls import explains_arguments
+from gpmpc.exceptions import (
+    SettingError,
+    ShapeError,
+    check_kind,
+    check_number,
+    check_numbers,
+)
 from gpmpc.mpc._controller import Array, Reference
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Problem
@@ -105,6 +112,7 @@ def turned(reference: Reference, turns: Array) -> Reference:
     return replace(reference, states=states + turns)
 
 
+@explains_arguments
 def kicks(
     problem: Problem, horizon: int, initial_input: Array, share: float = 0.5
 ) -> list[Array]:
@@ -128,6 +136,9 @@ def kicks(
     See Also:
         ``ManyStarts``, which searches from them.
     """
+    check_kind("problem", problem, Problem, "Problem(...)")
+    check_number("horizon", horizon, least=1, whole=True)
+    check_numbers("initial_input", initial_input, problem.input_dim)
     drift = np.tile(np.asarray(initial_input, dtype=float), (horizon, 1))
     length = max(1, horizon // 6)
     lower, upper = problem.inputs.first

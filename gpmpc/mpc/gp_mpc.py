@@ -36,7 +36,7 @@ import numpy as np
 
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, linearize
-from gpmpc.exceptions import SettingError, check_number
+from gpmpc.exceptions import SettingError, check_method, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import DelayedModel
 from gpmpc.mpc._condense import condense
@@ -48,7 +48,6 @@ from gpmpc.mpc._controller import (
     Reference,
     Request,
     Timing,
-    check_method,
     read_parameters,
 )
 from gpmpc.mpc._cost import FunctionNotFinite

@@ -20,7 +20,7 @@ way: its price falls to what cannot outweigh the cost (``gpmpc.mpc._elastic``).
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from statistics import NormalDist
@@ -29,7 +29,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from gpmpc._calls import explains_arguments
-from gpmpc.exceptions import SettingError, check_number
+from gpmpc.exceptions import SettingError, check_kind, check_number
 from gpmpc.mpc._cost import (
     Expansion,
     FunctionNotFinite,
@@ -428,12 +428,11 @@ class Problem:
         value = getattr(self, key)
         if value is None:
             return ()
-        parts = (value,) if isinstance(value, kind) else tuple(value)
+        parts = (value,)
+        if isinstance(value, Iterable) and not isinstance(value, str | Mapping):
+            parts = tuple(value)
         for part in parts:
-            if not isinstance(part, kind):
-                raise SettingError(
-                    key, f"must be {examples}; got {type(part).__name__}"
-                )
+            check_kind(key, part, kind, examples)
             size = getattr(part, "size", None)
             if size not in (None, self.state_dim):
                 rule = f"must bound {self.state_dim} states"

@@ -18,8 +18,17 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import UnsupportedModel
-from gpmpc.plotting._style import DASHED, FLOWN, PLAN, REFERENCE, TUBE, styled
+from gpmpc.plotting._style import (
+    DASHED,
+    FLOWN,
+    PLAN,
+    REFERENCE,
+    TUBE,
+    check_run,
+    styled,
+)
 
 if TYPE_CHECKING:
     from gpmpc.recording import Run
@@ -32,6 +41,7 @@ _DPI = 80
 _LENGTHS = {"m": 1.0, "cm": 1e2, "mm": 1e3, "µm": 1e6}  # units, in one metre
 
 
+@explains_arguments
 def animate(run: "Run", path: str | Path) -> None:
     """Writes the flight as a GIF, or as an MP4 by the file's ending.
 
@@ -42,6 +52,7 @@ def animate(run: "Run", path: str | Path) -> None:
     Raises:
         UnsupportedModel: The recording has no step, or no position in space.
     """
+    check_run(run)
     if not {"x", "y", "z"} <= run.pose.keys() or not len(run.times):
         raise UnsupportedModel(
             f"{run.path}: an animation needs steps with positions x, y and z"

@@ -14,9 +14,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, UnsupportedModel
 from gpmpc.plotting._animation import save_animation
-from gpmpc.plotting._style import FLOWN, PLAN, REFERENCE
+from gpmpc.plotting._style import FLOWN, PLAN, REFERENCE, check_run
 
 if TYPE_CHECKING:
     from gpmpc.recording import Run
@@ -41,6 +42,7 @@ class _JointDynamics(Protocol):
     def positions(self, state: Array, /) -> Array: ...
 
 
+@explains_arguments
 def film(
     run: "Run",
     system: "System",
@@ -66,6 +68,7 @@ def film(
         UnsupportedModel: The system is none of MuJoCo whose state says where its joints
             are, or no step was recorded.
     """
+    check_run(run)
     dynamics = system.dynamics
     shows_joints = hasattr(dynamics, "model") and hasattr(dynamics, "positions")
     if not len(run.times) or not shows_joints:

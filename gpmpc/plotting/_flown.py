@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import ShapeError, check_kind
 from gpmpc.plotting._style import (
     COLOURS,
@@ -30,6 +31,7 @@ class _Panel(NamedTuple):
     unit: str
 
 
+@explains_arguments
 @styled
 def flight_figure(rollout: "Rollout", system: "System") -> Figure:
     """Draws states against their references, and below them inputs with their bounds.

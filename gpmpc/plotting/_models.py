@@ -8,6 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
+from gpmpc._calls import explains_arguments
+from gpmpc.exceptions import check_kind
 from gpmpc.plotting._style import (
     BLUE,
     COLOURS,
@@ -42,12 +44,16 @@ class _Level(NamedTuple):
     colour: np.ndarray
 
 
+@explains_arguments
 @styled
 def calibration_figure(calibration: "Calibration") -> Figure:
     """Draws coverage, log density and error over the steps ahead, a column a state.
 
     The nominal levels of coverage are dashed.
     """
+    from gpmpc.calibration import Calibration
+
+    check_kind("calibration", calibration, Calibration, "what calibrate returns")
     n = len(calibration.names)
     figure, axes = make_figure(
         width=1.5 + 2.4 * n, height=6.0, rows=3, columns=n, sharex=True
@@ -124,6 +130,7 @@ def _name_levels(axis: Axes, levels: list[_Level]) -> None:
         lowest = height + 0.085
 
 
+@explains_arguments
 @styled
 def innovations_figure(
     run: "FilterRun", time_step: float = 1.0, names: list[str] | None = None
@@ -132,6 +139,9 @@ def innovations_figure(
 
     The legend says how many are outside of 95 %.
     """
+    from gpmpc.estimation import FilterRun
+
+    check_kind("run", run, FilterRun, "what KalmanFilter.run returns")
     stds = run.innovation_covariances.diagonal(dim1=-2, dim2=-1).sqrt()
     normalized = (run.innovations / stds).cpu().numpy()
     p = normalized.shape[1]
@@ -167,12 +177,16 @@ def _draw_innovations(axis: Axes, times: np.ndarray, normalized: np.ndarray) -> 
     axis.legend(loc="upper right", fontsize="small")
 
 
+@explains_arguments
 @styled
 def judgement_figure(judgement: "Judgement") -> Figure:
     """Draws the errors over the steps for every predictor.
 
     Below stand coverage and width of the model's intervals.
     """
+    from gpmpc.logs import Judgement
+
+    check_kind("judgement", judgement, Judgement, "what judge returns")
     n = len(judgement.groups)
     figure, axes = make_figure(
         width=2.6 * n,
@@ -234,9 +248,13 @@ def _draw_intervals(axis: Axes, judgement: "Judgement", group: int) -> None:
     axis.set(xscale="log", ylim=(0.5, 1.5), xlabel="steps ahead")
 
 
+@explains_arguments
 @styled
 def inspection_figure(inspection: "Inspection") -> Figure:
     """Draws each channel over the time, with its gaps, on one page."""
+    from gpmpc.logs import Inspection
+
+    check_kind("inspection", inspection, Inspection, "what inspect_log returns")
     over_rows = inspection.streams["rate [Hz]"].isna().all()
     channels = list(inspection.lines.items())[:_CHANNELS_PER_PAGE]
     if not channels:

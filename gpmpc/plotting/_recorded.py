@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gpmpc._angles import whole_turns
+from gpmpc._calls import explains_arguments
 from gpmpc.plotting._style import (
     BLUE,
     DASHED,
@@ -22,6 +23,7 @@ from gpmpc.plotting._style import (
     SKY,
     TUBE,
     VERMILION,
+    check_run,
     legend_below,
     make_figure,
     name_of,
@@ -74,6 +76,7 @@ class _Tracked(NamedTuple):
     expected_std: np.ndarray  # (K,)
 
 
+@explains_arguments
 @styled
 def tracking_figure(run: "Run") -> Figure:
     """Draws every tracked state and angle over time against its reference.
@@ -81,6 +84,7 @@ def tracking_figure(run: "Run") -> Figure:
     Below it stand the error of tracking, and the error of the prediction one step
     ahead with its tube, where something was predicted.
     """
+    check_run(run)
     tracked_states = _tracked_states(run)
     n = len(tracked_states)
     is_predicted = any(
@@ -207,9 +211,11 @@ def _noise_in_words(run: "Run") -> str:
     return "as planned"
 
 
+@explains_arguments
 @styled
 def inputs_figure(run: "Run") -> Figure:
     """Draws what acted, over time, with its bounds."""
+    check_run(run)
     m = len(run.input_names)
     units = run.metadata.get("units", {})
     figure, axes = make_figure(
@@ -240,9 +246,11 @@ def inputs_figure(run: "Run") -> Figure:
     return figure
 
 
+@explains_arguments
 @styled
 def timing_figure(run: "Run") -> Figure:
     """Draws the parts of the time of every decision, and the totals' distribution."""
+    check_run(run)
     figure, ((over_time, distribution),) = make_figure(
         width=8.4,
         height=3.6,

@@ -16,6 +16,9 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from gpmpc._calls import explains_arguments
+from gpmpc.exceptions import check_kind
+
 BLUE = "#0072b2"
 VERMILION = "#d55e00"
 GREEN = "#009e73"
@@ -108,8 +111,16 @@ def legend_below(figure: Figure, axes: Iterable[Axes]) -> None:
     )
 
 
+@explains_arguments
 def png(figure: Figure, dpi: int = 150) -> bytes:
     """Returns the figure as PNG."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()
+
+
+def check_run(run: object) -> None:
+    """Raises ``SettingError`` unless what is to be drawn is a recorded run."""
+    from gpmpc.recording import Run  # here: a report of a sweep does not need it
+
+    check_kind("run", run, Run, "a Run of read_run")

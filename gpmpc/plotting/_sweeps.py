@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
 
+from gpmpc._calls import explains_arguments
 from gpmpc.plotting._style import (
     COLOURS,
     clipped,
@@ -29,6 +30,7 @@ class Series:
     values: Sequence[Sequence[float]]
 
 
+@explains_arguments
 @styled
 def over_variable(
     title: str,
@@ -203,6 +205,7 @@ def _draw_values(
     )
 
 
+@explains_arguments
 @styled
 def search_figure(
     costs: Sequence[float], importances: Mapping[str, float], unchanged: float | None

@@ -145,6 +145,7 @@ class Linearization(NoisyPropagator):
         return _linear_moments(belief, prediction, A)
 
 
+@explains_arguments
 class MeanEquivalence(NoisyPropagator):
     """The prediction at the belief's mean, without the uncertainty of the state.
 

@@ -18,8 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, tensors_for, to_array
-from gpmpc.exceptions import ShapeError
+from gpmpc.exceptions import ShapeError, check_method
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.propagation._propagator import Propagator, Sensitivity, differentiate
 
@@ -54,6 +55,7 @@ def square_roots(covariances: Array) -> Roots:
     return Roots(root=(U * r[..., None, :]) @ U.mT, r=r, U=U)
 
 
+@explains_arguments
 def linearize(
     propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None
 ) -> LocalModel:
@@ -174,6 +176,7 @@ def _congruence(U: Array, X: Array) -> Array:
     return U[..., None, :, :] @ (U @ X.reshape(*X.shape[:-2], -1)).reshape(X.shape)
 
 
+@explains_arguments
 def rollout(
     propagator: Propagator, model: Any, belief: Gaussian, inputs: Tensor
 ) -> Gaussian:
@@ -190,6 +193,7 @@ def rollout(
 
     Raises:
         ShapeError: The inputs have no step.
+        SettingError: The propagator is none, or the inputs are no tensor.
 
     >>> import torch
     >>> from gpmpc.gaussian import Gaussian
@@ -204,6 +208,7 @@ def rollout(
     See Also:
         ``gpmpc.calibration.calibrate``, which compares such beliefs with a log.
     """
+    check_method("propagator", propagator, "propagate", "Linearization()")
     check_tensors(inputs=inputs)
     if inputs.dim() < 2 or not inputs.shape[-2]:
         raise ShapeError(

@@ -152,6 +152,7 @@ class MomentMatching(NoisyPropagator):
         return latent_moments, latent_derivatives
 
 
+@explains_arguments
 def best_propagator(model: Any) -> Propagator:
     """Makes ``MomentMatching()`` if a model has exact moments, else ``Unscented()``.
 

@@ -7,8 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import batched_jacobian, check_query
-from gpmpc.exceptions import DataError, SettingError
+from gpmpc.exceptions import DataError, SettingError, check_flag
 from gpmpc.gaussian import (
     Gaussian,
     check_tensors,
@@ -123,6 +124,7 @@ class NoisyPropagator(Propagator):
     diagonal = False  #: whether only the predicted covariance's diagonal is computed
 
     def __init__(self, process_noise: bool = True):
+        check_flag("process_noise", process_noise)
         self.process_noise = process_noise
 
     def propagate(
@@ -155,6 +157,7 @@ class NoisyPropagator(Propagator):
         )
 
 
+@explains_arguments
 def differentiate(
     propagator: Propagator, model: Any, belief: Gaussian, input: Tensor | None = None
 ) -> tuple[Propagation, Sensitivity]:

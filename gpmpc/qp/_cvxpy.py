@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_triangular
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_rescue import rescue
@@ -56,6 +57,7 @@ A solution that misses them is judged by its residuals.
 """
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class CvxpySolver:
     """Solves through CVXPY.

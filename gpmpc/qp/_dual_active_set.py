@@ -21,7 +21,9 @@ from time import perf_counter
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gpmpc._calls import explains_arguments
 from gpmpc._compiled import compile_for, unchecked_entry_point
+from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_kernels import SIGNATURE, solve_kernel
 from gpmpc.qp._dual_rescue import rescue
@@ -51,6 +53,7 @@ _ITERATIONS_PER_CONSTRAINT = 10
 _ITERATIONS_PER_LOOK = 25  # iterations between two looks at the clock
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class DualActiveSet:
     """The dual active-set method.
@@ -117,6 +120,11 @@ class DualActiveSet:
                 else self._workplace(shape, prices)
             )
         except (AttributeError, KeyError, TypeError):
+            if not isinstance(problem, tuple):
+                got = type(problem).__name__
+                raise ProblemError(
+                    f"problem must be QuadraticProgram(...); got {got}"
+                ) from None
             # the first program of its shape, or an unchecked one without a shape
             problem = QuadraticProgram.from_stacked(*problem)
             workplace = self._workplace(problem.G.shape, prices)

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, qr, solve_triangular
 from scipy.optimize import linprog
 
+from gpmpc._calls import explains_arguments
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_rescue import rescue
 from gpmpc.qp._problem import ABSENT, QuadraticProgram, check_positive
@@ -80,6 +81,7 @@ class _Outcome(NamedTuple):
     active: Array | None = None  # (M,) as in ``make_solution``; no row if None
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class PrimalActiveSet:
     """The paper's Algorithm 1 with phase 1; an object holds settings only.

@@ -258,5 +258,6 @@ def check_positive(settings: object, *names: str) -> None:
     """Raises ``ProblemError`` unless settings of a solver are positive or None."""
     for name in names:
         value = getattr(settings, name)
-        if value is not None and not value > 0:
+        is_number = isinstance(value, int | float | np.number)
+        if value is not None and not (is_number and value > 0):
             raise ProblemError(f"{name} must be positive; got {value}")

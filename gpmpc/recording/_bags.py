@@ -12,6 +12,7 @@ from mcap.opcode import Opcode
 from mcap.records import Statistics
 from mcap.writer import MCAP0_MAGIC
 
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import RecordingError
 from gpmpc.recording._flaws import (
     NO_CHECKSUMS,
@@ -41,6 +42,7 @@ class _CutOff(Exception):
     """A file has no end; the text says where it is broken."""
 
 
+@explains_arguments
 def bag_flaws(path: str | Path) -> tuple[Flaw, ...]:
     """Says what is wrong with a file, as far as its frames, counts and checksums tell.
 

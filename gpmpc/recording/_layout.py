@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc.recording._run import TIMINGS, Run
 from gpmpc.recording._scene import DISPLAY, VEHICLE, WORLD
 from gpmpc.recording._schema import PLAN, STEP
@@ -34,6 +35,7 @@ _Panels = dict[str, _Panel]  # by id
 _Groups = dict[str, list[str]]  # names of states by their title
 
 
+@explains_arguments
 def layout(run: Run) -> str:
     """Returns the layout for a recording, as JSON.
 

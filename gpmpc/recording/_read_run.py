@@ -3,6 +3,8 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from gpmpc._calls import explains_arguments
+from gpmpc._files import as_path
 from gpmpc.exceptions import RecordingError
 from gpmpc.recording._content import (
     FileContent,
@@ -27,6 +29,7 @@ from gpmpc.recording._run import TIMINGS, Run
 from gpmpc.recording._schema import RECOVERY_METADATA
 
 
+@explains_arguments
 def read_run(path: str | Path) -> Run:
     """Reads a recording, finished or not.
 
@@ -39,7 +42,7 @@ def read_run(path: str | Path) -> Run:
     See Also:
         ``replay``, which solves the program of a step again; ``McapRecorder``.
     """
-    path = Path(path)
+    path = as_path(path)
     content = read_content(path)
     flaws = list(content.flaws)
     described = names_in_metadata(path, content)

@@ -21,6 +21,7 @@ from foxglove.mcap import MCAPWriteOptions
 from foxglove.messages import Log, LogLevel, Timestamp
 
 from gpmpc._calls import explains_arguments
+from gpmpc._files import as_path
 from gpmpc._provenance import flattened, provenance
 from gpmpc.exceptions import RecordingError, check_kind, check_number
 from gpmpc.recording._encoding import Encoder, StepCopy
@@ -79,7 +80,7 @@ class McapRecorder:
         check_kind("system", system, RecordedSystem, "RecordedSystem.of(system)")
         described = _describe(system, metadata or {})
 
-        self.path = Path(path)
+        self.path = as_path(path)
         #: where a viewer finds the live view, such as ``ws://127.0.0.1:8765``
         self.address: str | None = None
         self._n = len(system.state_names)

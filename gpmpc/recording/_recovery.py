@@ -8,6 +8,7 @@ from typing import BinaryIO
 from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
+from gpmpc._calls import explains_arguments
 from gpmpc._files import whole_file
 from gpmpc.exceptions import RecordingError
 from gpmpc.recording._flaws import Flaw
@@ -17,6 +18,7 @@ from gpmpc.recording._run import Run
 from gpmpc.recording._schema import CHANNELS_METADATA, RECOVERY_METADATA
 
 
+@explains_arguments
 def recover(path: str | Path, output: str | Path) -> Run:
     """Writes everything whole in a recording to a new file with index, and reads that.
 

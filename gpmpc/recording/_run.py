@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gpmpc.exceptions import GpmpcError, RecordingError
+from gpmpc._calls import explains_arguments
+from gpmpc.exceptions import GpmpcError, RecordingError, check_kind
 from gpmpc.recording._encoding import deviations
 from gpmpc.recording._flaws import LOST_CHUNKS, LOST_STEPS, NO_CHECKSUMS, Flaw
 from gpmpc.recording._problems import RecordedProblem, residuals, solve_again
@@ -154,6 +155,7 @@ def _columns(field: str, names: Sequence[str], values: Array) -> dict[str, Array
     }
 
 
+@explains_arguments
 def replay(run: Run, k: int) -> "QPSolution":
     """Solves the recorded quadratic program of step k again.
 
@@ -164,6 +166,7 @@ def replay(run: Run, k: int) -> "QPSolution":
     See Also:
         ``read_run``, which reads a recording.
     """
+    check_kind("run", run, Run, "a Run of read_run")
     recorded = run.problems.get(k)
     if recorded is None:
         raise RecordingError(

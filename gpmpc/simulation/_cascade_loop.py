@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gpmpc._angles import wrap
+from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import Diverged, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Controller, FlightJudge, Reference
@@ -43,6 +44,7 @@ _INNER = slice(6, 12)
 Recorder = Callable[[Literal["outer", "inner"], Step], None]
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Cascade:
     """An outer and an inner controller, whose references are the outer one's inputs.
@@ -100,6 +102,7 @@ class CascadeRollout:
     inner: Rollout
 
 
+@explains_arguments
 def cascade_loop(
     plant: System,
     cascade: Cascade,

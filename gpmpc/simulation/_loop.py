@@ -201,6 +201,7 @@ def closed_loops(
     return trials
 
 
+@explains_arguments
 def rehearse(
     system: System | ModelLoop,
     controller: Controller,

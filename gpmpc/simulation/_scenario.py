@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.exceptions import SettingError, ShapeError, check_number
+from gpmpc.exceptions import SettingError, ShapeError, check_method, check_number
 from gpmpc.models._past import measured_dim
 from gpmpc.mpc import Controller, FlightJudge, Reference
-from gpmpc.mpc._controller import check_method, read_reference
+from gpmpc.mpc._controller import read_reference
 from gpmpc.mpc._policy import OnFailure, check_policy
 from gpmpc.signals import Signals, signals_of
 from gpmpc.simulation._disturbances import Disturbance

@@ -21,6 +21,7 @@ from gpmpc.exceptions import (
     Diverged,
     SettingError,
     ShapeError,
+    check_method,
     check_number,
     check_numbers,
 )
@@ -148,6 +149,8 @@ class PlantSimulator:
                 "disturbances", f"must be a list of them; got {disturbances!r}"
             )
         self.plant = plant
+        for disturbance in disturbances:
+            check_method("disturbances", disturbance, "disturb_plant", "Gust(...)")
         self.disturbances = disturbances
         self.noise = _read_noise(noise or Noise(), plant)
         self._steps = 0

@@ -10,7 +10,14 @@ import numpy as np
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.datasets import DataSource
-from gpmpc.exceptions import SettingError, ShapeError, check_choice, check_number
+from gpmpc.exceptions import (
+    SettingError,
+    ShapeError,
+    check_choice,
+    check_kind,
+    check_method,
+    check_number,
+)
 from gpmpc.gp import Training, Transitions
 from gpmpc.learning import EpisodicLearning, OnlineLearning
 from gpmpc.models import train
@@ -84,6 +91,8 @@ class Experiment:
     kinematics: Kinematics = "integrated"
 
     def __post_init__(self) -> None:
+        check_kind("system", self.system, System, "a System")
+        check_method("data", self.data, "transitions", "RandomData(...)")
         self._check_functions()
         self._check_numbers()
         self._check_loop()

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import Diverged, check_kind
 from gpmpc.gp import Training
@@ -44,6 +45,7 @@ class Flown:
     outlook: Outlook = field(default_factory=Outlook)
 
 
+@explains_arguments
 def run_trial(
     experiment: Experiment,
     prepare: Prepare | None = None,

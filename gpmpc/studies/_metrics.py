@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc._calls import explains_arguments
 from gpmpc.gp import Training
 from gpmpc.metrics import find_loss, time_quantiles, violation_rate
 from gpmpc.mpc._cost import FunctionNotFinite
@@ -19,6 +20,7 @@ from gpmpc.studies._flight import Flown, errors_of, rmse
 DECISION_STAGES = ("model", "build", "solve", "total")
 
 
+@explains_arguments
 def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
     """Returns the results of a flight as plain data.
 

@@ -3,11 +3,13 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from gpmpc._calls import explains_arguments
 from gpmpc.studies._document import Table
 
 Result = Mapping[str, Any]  # content of metrics.json
 
 
+@explains_arguments
 def summary(result: Result) -> Table:
     """Returns a run's metrics in words; what there is nothing to say of has no line."""
     unit = result["unit"]

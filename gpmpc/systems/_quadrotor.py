@@ -178,6 +178,7 @@ class Coupled:
         ]
 
 
+@explains_arguments
 @dataclass(frozen=True)
 class Map:
     """Reads a right-hand side as the next state, x[k+1] = f(x[k], u[k]).

@@ -1,6 +1,6 @@
 """Describes a system that is controlled: its dynamics, its names, how it is flown."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import inf, isfinite
@@ -15,6 +15,7 @@ from gpmpc.exceptions import (
     GpmpcError,
     SettingError,
     ShapeError,
+    check_kind,
     check_number,
     check_numbers,
 )
@@ -118,18 +119,29 @@ class System:
             )
         states = _names(self.dynamics, "state_names")
         inputs = _names(self.dynamics, "input_names")
+        for name in inputs:
+            if name in states:
+                rule = "must be no names of states"
+                raise SettingError("dynamics.input_names", f"{rule}; got {name!r}")
         self._set("name", self.name or type(self.dynamics).__name__)
         self._complete_units((*states, *inputs))
         self._complete_tracked(states)
         self._check_lost()
         self._complete_vectors(states, inputs)
-        if self.nominal is not None and self.nominal.signals != self.signals:
+        self._check_nominal()
+        self._check_dynamics()
+
+    def _check_nominal(self) -> None:
+        """Raises unless what is known before is a system of these signals, or None."""
+        if self.nominal is None:
+            return
+        check_kind("nominal", self.nominal, System, "System(dynamics, time_step)")
+        if self.nominal.signals != self.signals:
             raise SettingError(
                 "nominal",
                 f"must have the states, inputs and time step {self.signals}; "
                 f"got {self.nominal.signals}",
             )
-        self._check_dynamics()
 
     def _complete_units(self, names: Sequence[str]) -> None:
         """Gives every state and input a unit."""
@@ -139,6 +151,10 @@ class System:
             raise SettingError(
                 "units", f"must be of {', '.join(names)}; got {', '.join(unknown)}"
             )
+        for name, unit in self.units.items():
+            if not isinstance(unit, str):
+                rule = "must be texts, such as 'm'"
+                raise SettingError("units", f"{rule}; got {unit!r} of {name}")
         self._set("units", {name: self.units.get(name, UNKNOWN) for name in names})
 
     def _complete_tracked(self, states: Sequence[str]) -> None:
@@ -148,10 +164,9 @@ class System:
             unit = self.units[states[0]]
             tracked = [name for name in states if self.units[name] == unit]
         for key in ("angles", "tracked"):
-            if isinstance(getattr(self, key), str):
-                raise SettingError(
-                    key, f"must be a list of names; got {getattr(self, key)!r}"
-                )
+            value = getattr(self, key)
+            if isinstance(value, str) or not isinstance(value, Iterable):
+                raise SettingError(key, f"must be a list of names; got {value!r}")
         _check_mapping("rates", self.rates)
         _check_mapping("pose", self.pose)
         self._set("angles", tuple(self.angles))
@@ -390,8 +405,27 @@ class System:
                     f"must be finite at state {x}, input {u}; "
                     f"{name} is {entry} after it",
                 )
+        self._check_exchanged_rates(x, u)
+
+    def _check_exchanged_rates(self, x: list[float], u: list[float]) -> None:
+        """Raises where the dynamics show that a rate was taken for its position."""
+        if not (self.rates and hasattr(self.dynamics, "derivative")):
+            return
+        nearby = [value + 0.01 * (i + 1) for i, value in enumerate(x)]
+        try:
+            slopes = [float(entry) for entry in self.dynamics.derivative(nearby, u)]
+        except Exception:  # nothing is known of it there
+            return
+        for rate, position in self.rates.items():
+            i = self.state_names.index(rate)
+            j = self.state_names.index(position)
+            if slopes[i] == nearby[j] and slopes[j] != nearby[i]:
+                rule = "must map a rate to what it is the rate of"
+                right = f"{{{position!r}: {rate!r}}}"
+                raise SettingError("rates", f"{rule}, such as {right}; got exchanged")
 
 
+@explains_arguments
 def step(plant: System, state: Array, input: Array) -> Array:
     """Returns the next state (n,) of a plant from a state (n,) and an input (m,).
 
@@ -418,6 +452,7 @@ def step(plant: System, state: Array, input: Array) -> Array:
     return np.array(plant.successor(state, input), dtype=float)
 
 
+@explains_arguments
 def step_many(plant: System, states: Array, inputs: Array) -> Array:
     """Returns the next states (T, n) of T copies of a plant, in one evaluation.
 

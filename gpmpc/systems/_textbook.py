@@ -245,6 +245,7 @@ class DoublePendulum(_Body):
         return [a_dot, a_ddot, b_dot, b_ddot]
 
 
+@explains_arguments
 def acrobot(
     masses: Sequence[float] = (1.0, 1.0),
     first_length: float = 1.0,

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, DynamicsModel, Linearized
 from gpmpc.gaussian import Gaussian
 from gpmpc.testing._promise import require, require_close, require_covariance
@@ -20,6 +21,7 @@ class _Points(NamedTuple):
     numeric: float  # tolerance of finite differences
 
 
+@explains_arguments
 def check_model(
     model: DynamicsModel,
     states: Tensor | None = None,

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, linearize
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian, square_root
@@ -58,6 +59,7 @@ class _Case:
         return 10 * self.samples**-0.5 if self.samples else 0.0
 
 
+@explains_arguments
 def check_propagator(
     propagator: Propagator,
     model: Any = None,

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from gpmpc._calls import explains_arguments
 from gpmpc.qp import QPSolution, QPSolver, QuadraticProgram
 from gpmpc.status import Status
 from gpmpc.testing._promise import require
@@ -28,6 +29,7 @@ class _SolvedProblem(NamedTuple):
     multipliers: ArrayLike | None = None
 
 
+@explains_arguments
 def check_qp_solver(solver: QPSolver, tolerance: float = 1e-6) -> None:
     """Checks a solver against the protocol ``gpmpc.qp.QPSolver``.
 

@@ -153,7 +153,9 @@ def test_a_delay_is_found_where_a_spinning_pendulum_wraps():
     assert estimate.steps == pytest.approx(3, abs=0.15)
     counting = estimate_delay(states, inputs)
     assert np.allclose(estimate.correlations, counting.correlations, atol=1e-4)
-    with pytest.raises(SettingError, match=r"angles: must be indices of 2 states"):
+    with pytest.raises(
+        SettingError, match=r"angles: must be a list of different indices"
+    ):
         estimate_delay(wrapped, inputs, angles=[2])
 
 

@@ -473,7 +473,7 @@ def test_errors_of_the_wrong_size_are_inconsistent():
         (
             lambda m: Measurement.of_states(2, [2], [0.1]),
             SettingError,
-            "states: must be indices from 0 to 1",
+            "states: must be a list of different indices",
         ),
         (
             lambda m: Measurement.of_states(2, [1], [-0.1]),

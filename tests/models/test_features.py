@@ -308,7 +308,7 @@ def test_code_without_a_path_that_leads_to_it_is_refused(tmp_path, monkeypatch):
         (
             {"angles": [2]},
             SettingError,
-            r"angles: must be different indices from 0 to 1; got \[2\]",
+            r"angles: must be a list of different indices from 0 to 1; got \[2\]",
         ),
         (
             {"states": [1], "angles": [0]},

@@ -209,7 +209,7 @@ def one_cell(name, row, column, value):
         (change(B=2.0), "B must be a list"),
         (change(angles=""), "angles is neither"),
         (change(states={}), "states is of an unknown kind"),
-        (change(states=[0.5]), "states: must be different indices"),
+        (change(states=[0.5]), "states: must be a list of different indices"),
         (change(residual=None), "residual is neither"),
         (change(residual={"kind": []}), "residual is of an unknown kind"),
         (change(kind=["ResidualModel"]), "holds a"),

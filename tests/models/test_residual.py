@@ -230,12 +230,12 @@ def test_any_trainer_learns_residuals_and_nothing_else_does():
         (
             {"states": [2.0, 0]},
             SettingError,
-            r"states: must be different indices from 0 to 2; got \[2.0, 0\]",
+            r"states: must be a list of different indices from 0 to 2; got \[2.0, 0\]",
         ),
         (
             {"inputs": [True]},
             SettingError,
-            r"inputs: must be different indices from 0 to 1; got \[True\]",
+            r"inputs: must be a list of different indices from 0 to 1; got \[True\]",
         ),
         (
             {"states": [2]},
@@ -245,12 +245,12 @@ def test_any_trainer_learns_residuals_and_nothing_else_does():
         (
             {"states": [2, 3]},
             SettingError,
-            r"states: must be different indices from 0 to 2; got \[2, 3\]",
+            r"states: must be a list of different indices from 0 to 2; got \[2, 3\]",
         ),
         (
             {"inputs": [2]},
             SettingError,
-            r"inputs: must be different indices from 0 to 1; got \[2\]",
+            r"inputs: must be a list of different indices from 0 to 1; got \[2\]",
         ),
         (
             {"states": [1, 1]},

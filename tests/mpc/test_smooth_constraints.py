@@ -260,5 +260,7 @@ def test_mistakes_are_one_clear_error():
             3,
             [0.0] * 2,
         )
-    with pytest.raises(SettingError, match="angles: must be a list of indices of 2"):
+    with pytest.raises(
+        SettingError, match="angles: must be a list of different indices"
+    ):
         Tracking([1.0] * 2, [1.0], angles=[2])
