@@ -129,10 +129,9 @@ def test_training_refuses_a_nominal_model_of_numpy():
     ):
         with pytest.raises(SettingError, match=f"nominal: .*{advice}"):
             ResidualModel.train(nominal, transitions(), trainer=trainer)
-        model = KnownModel(nominal, 2, 1)
         states = np.array([[0.1, 0.2], [0.3, 0.4]])
         with pytest.raises(SettingError, match=f"function: .*{advice}"):
-            model.linearize(states, np.ones((2, 1)))
+            KnownModel(nominal, 2, 1).linearize(states, np.ones((2, 1)))
     effect = torch.ones(2, 1, dtype=F)
     with pytest.raises(SettingError, match=r"B: .*torch.exp for np.exp"):
         ResidualModel.train(
@@ -144,9 +143,8 @@ def test_training_refuses_a_nominal_model_of_numpy():
 
 
 def test_one_point_of_math_does_not_lose_its_derivative():
-    model = KnownModel(lambda x, u: x * math.cos(x[..., 0]), 2, 1)
     with pytest.raises(SettingError, match=r"torch.cos for math.cos"):
-        model.linearize(np.zeros((1, 2)), np.zeros((1, 1)))
+        KnownModel(lambda x, u: x * math.cos(x[..., 0]), 2, 1)
     good = KnownModel(lambda x, u: x * torch.cos(x[..., :1]), 2, 1)
     linearized = good.linearize(STATE[None], np.zeros((1, 1)))
     twice = good.linearize(np.tile(STATE, (2, 1)), np.zeros((2, 1)))

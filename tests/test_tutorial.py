@@ -47,6 +47,9 @@ def test_the_story_of_the_tutorial_holds(page, tmp_path, capsys):
     many = names["swing_ahead"](names["gp"])
     assert few["rmse"] > 5 * many["rmse"]
     assert few["coverage_0.95"] < 0.5 < many["coverage_0.95"]
+    gentle = names["gentle"]
+    within = names["Recording"](gentle[:, :4], gentle[:-1, 4:])
+    assert names["swing_ahead"](names["gp"], within)["coverage_0.95"] > 0.94
     goal = names["plant"].goal
     radii = [
         names[key].stability(goal).spectral_radius for key in ("short", "controller")

@@ -133,8 +133,12 @@ class KnownModel:
         states = torch.zeros(rows, n, dtype=self.dtype)
         inputs = torch.zeros(rows, m, dtype=self.dtype)
         rule = f"must give next states (*batch, {n}) of states (*batch, {n}) and inputs"
+        # torch has to follow it, unless it brings its derivatives.
+        is_followed = not hasattr(self.function, "linearize")
+        states.requires_grad_(is_followed)
+        inputs.requires_grad_(is_followed)
         try:
-            with torch.no_grad():
+            with torch.set_grad_enabled(is_followed):
                 value = call("function", self.function, states, inputs)
         except GpmpcError:
             raise
