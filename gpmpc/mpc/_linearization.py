@@ -369,9 +369,8 @@ class PredictionModel:
 
         All of them are the first one where these are not finite.
         """
-        states = self.roll_out_means.open_loop(state[None], inputs[None], disturbance)[
-            0
-        ]
+        batch = self.roll_out_means.open_loop(state[None], inputs[None], disturbance)
+        states = batch[0]
         return states if np.isfinite(states).all() else np.tile(state, (len(states), 1))
 
 

@@ -156,11 +156,15 @@ class Box(Constraint):
         lower_side = None if self.lower is None else read_numbers("lower", self.lower)
         upper_side = None if self.upper is None else read_numbers("upper", self.upper)
         shape: tuple[int, ...] = (0,)
-        for side in (upper_side, lower_side):
-            shape = shape if side is None else side.shape
+        if lower_side is not None:
+            shape = lower_side.shape
+        elif upper_side is not None:
+            shape = upper_side.shape
         lower = self._check_side("lower", lower_side, shape, absent=-math.inf)
         upper = self._check_side("upper", upper_side, shape, absent=math.inf)
-        for index in map(tuple, np.argwhere(lower > upper)[:1]):
+        crossed = np.argwhere(lower > upper)
+        if len(crossed):
+            index = tuple(crossed[0])
             got = f"entry {index[-1]} has {lower[index]:g} above {upper[index]:g}"
             raise SettingError("lower, upper", f"must not cross; {got}")
         object.__setattr__(self, "lower", lower)

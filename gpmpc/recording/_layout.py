@@ -60,7 +60,7 @@ def layout(run: Run) -> str:
         "minLogLevel": 1,
         "topicToRender": "/log",
     }
-    left: Any = _LOG_PANEL
+    left: str | dict[str, Any] = _LOG_PANEL
     left_share = 25  # [%]
     if "/pose" in run.channels:
         panels[_SCENE_PANEL] = _scene("Position" in groups, "Attitude" in groups)
