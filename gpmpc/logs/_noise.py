@@ -26,8 +26,8 @@ from gpmpc.models._windows import Windows
 
 _STEPS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # whose errors are explained
 _WINDOWS = 2000  # of a fold, whose errors count
-_LINEARIZED = 200  # of a fold, along which rollouts are linearised: these are slow
-_LINEARIZED_WITH_MEMORY = 60  # likewise of models with many entries to carry on
+_LINEARIZED = 400  # of all folds, along which rollouts are linearised: these are slow
+_LINEARIZED_WITH_MEMORY = 120  # likewise of models with many entries to carry on
 _STRIDE_WITH_MEMORY = 8  # of the windows that are linearised of these
 _DIFFERENCE = 1e-6
 _NOTHING = 1e-300  # least variance that anything is divided by
@@ -119,8 +119,9 @@ def fit_noise(
         longest: Steps of the rollouts.
     """
     steps = [step for step in _STEPS if step <= longest]
+    linearized = _LINEARIZED if models[0].memory.empty else _LINEARIZED_WITH_MEMORY
     folds = [
-        _fold_errors(model, log, steps, longest)
+        _fold_errors(model, log, steps, linearized // len(models))
         for model, log in zip(models, logs, strict=True)
     ]
     squared = np.concatenate([fold.squared for fold in folds]).mean(axis=0)
@@ -155,11 +156,17 @@ def _scales(kinematics: Kinematics, squared: Array, explained: Array) -> Array:
 
 
 def _fold_errors(
-    model: LogModel, log: Log, steps: Sequence[int], longest: int
+    model: LogModel, log: Log, steps: Sequence[int], linearized: int
 ) -> _FoldErrors:
-    """Computes the errors of a fold, and its responses to the sources of noise."""
-    windows = log.windows(longest, past=max(model.past, PAST), most=_WINDOWS)
-    linearized = _LINEARIZED if model.memory.empty else _LINEARIZED_WITH_MEMORY
+    """Computes the errors of a fold, and its responses to the sources of noise.
+
+    Args:
+        model: That was not fitted to the log.
+        log: Held-out runs.
+        steps: After the starts.
+        linearized: Number of windows along which rollouts are linearised, about.
+    """
+    windows = log.windows(max(steps), past=max(model.past, PAST), most=_WINDOWS)
     stride = -(-len(windows) // linearized)
     measured, modelled = model.first_outputs(windows)
     return _FoldErrors(

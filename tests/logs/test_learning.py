@@ -26,6 +26,7 @@ from gpmpc.logs._noise import error_variances, follow_errors
 from gpmpc.logs._output_gps import choose_rows, train_output_gp
 from gpmpc.models import LogModel, MultirotorNominal, RigidBodyKinematics
 from gpmpc.models._kinematics import Increments
+from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._parametric import AffineNominal
 from gpmpc.models._quaternions import rotation_quaternion
 
@@ -340,6 +341,25 @@ def test_intervals_follow_a_rougher_run_and_never_its_future(flights):
     np.testing.assert_array_equal(
         follow_errors(windows, changed, claimed, (10, 20))[early], scaled[early]
     )
+
+
+def test_intervals_are_as_wide_as_errors_where_claims_go_astray(flights):
+    windows = as_log(flights[:1]).windows(20, 20, 2)
+    rng = np.random.default_rng(0)
+    errors = rng.normal(size=(len(windows), 2, 12))
+    claimed = np.exp(rng.normal(size=errors.shape))
+    late = windows.times > 2
+    widths = np.sqrt(follow_errors(windows, errors, claimed, (10, 20))[late].mean(0))
+    assert 1.0 < widths.min() < widths.mean() < 1.35
+
+
+def test_scales_of_a_noise_lie_between_their_steps():
+    scales = np.array([[1.0, 2.0], [4.0, 2.0]])
+    noise = OutputNoise(np.ones((4, 2)), np.ones(2), (1, 100), scales)
+    expected = [[1.0, 2.0], [2.0, 2.0], [4.0, 2.0], [4.0, 2.0]]
+    np.testing.assert_allclose(noise.scales_at((1, 10, 100, 500)), expected)
+    without = OutputNoise(np.ones((4, 2)), np.ones(2))
+    np.testing.assert_array_equal(without.scales_at((1, 10)), np.ones((2, 2)))
 
 
 def test_chosen_rows_cover_what_is_rare():

@@ -208,6 +208,20 @@ def test_a_correction_keeps_a_share_of_the_movement():
     np.testing.assert_allclose(corrected, expected, atol=1e-6)
 
 
+def test_a_correction_that_keeps_no_movement_is_the_ridge_regression():
+    log = reactor_log(200)
+    windows = log.windows(10, past=20)
+    still = np.repeat(windows.states[:, 20:21], 10, axis=1)
+    wild = still + np.random.default_rng(0).normal(size=still.shape)
+    corrected = []
+    for predicted in (still, wild):
+        (ridge,) = Correction.fit_each(
+            Increments(log.space), windows, predicted, (1, 10), [Prior(0.01, 0.0)]
+        )
+        corrected.append(ridge(windows, predicted)[:, [0, 9]])
+    np.testing.assert_allclose(corrected[1], corrected[0], rtol=0, atol=1e-9)
+
+
 def test_averages_take_what_is_best_on_other_runs():
     log = log_of(
         [np.random.default_rng(i).normal(size=(100, 2)) for i in range(6)],
