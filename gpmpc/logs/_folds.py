@@ -2,13 +2,17 @@
 
 A fold says something only where its training rows cover what its held-out rows do. A
 transient and then rest, cut into two halves, asks each model to extrapolate to the
-other half, and every model but the simplest is refused. So runs are dealt to two folds
+other half, and every model but the simplest is refused. So runs are dealt to folds
 where there are many; of few runs, blocks of rows take turns, with a gap between them in
 the training rows, so that no held-out window overlaps what a model was fitted to.
+
+Half of many rows says what all of them say. Of a short log it does not, and structures
+are chosen that suit half of its rows: there four folds hold out a quarter each.
 """
 
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -19,12 +23,15 @@ from gpmpc.exceptions import DataError
 from gpmpc.logs._log import Log, LogRun
 
 _MANY_RUNS = 4  # from which on whole runs are dealt
+_SHORT = 3000  # rows of a log, below which it has more folds
+_FOLDS_OF_SHORT = 4
 _BLOCKS = (4, 8, 16)  # of a log of few runs
 _DEALS = 60  # ways to deal runs that are compared
-_BALANCED = 0.3  # least share of the rows in either fold
+_BALANCED = 0.6  # least rows of a fold, of their mean
 _NEARLY = 0.02  # of the coverage that decides nothing
 _MARGIN = 0.02  # of a range by which it may be exceeded
 _GAP_SHARE = 6  # a gap is no longer than a block divided by this
+_COUNTS = {2: "two", 4: "four"}
 
 
 class Fold(NamedTuple):
@@ -36,9 +43,9 @@ class Fold(NamedTuple):
 
 @dataclass(frozen=True)
 class Folds:
-    """Two folds of a log, each of which holds out what the other is fitted to."""
+    """Folds of a log, each of which is fitted to what the others hold out."""
 
-    pair: tuple[Fold, Fold]
+    parts: tuple[Fold, ...]  #: two or more
     words: str  #: how the log was split
     #: share of held-out rows inside the range of the rows that models are fitted to,
     #: for the fold and the state or input that are covered worst
@@ -54,7 +61,7 @@ class Folds:
 
 
 def split_folds(log: Log, past: int, steps: int) -> Folds:
-    """Splits a log into two folds.
+    """Splits a log into two folds; into four where it is short.
 
     Args:
         log: All runs.
@@ -64,20 +71,29 @@ def split_folds(log: Log, past: int, steps: int) -> Folds:
     Raises:
         DataError: No piece of the log is long enough for windows in both folds.
     """
+    if len(log) < _SHORT:
+        folds = _split(log, _FOLDS_OF_SHORT, past, steps)
+        if folds is not None:
+            return folds
+    folds = _split(log, 2, past, steps)
+    if folds is None:
+        return _halves(log)
+    return folds
+
+
+def _split(log: Log, count: int, past: int, steps: int) -> Folds | None:
+    """Splits a log into folds; returns None where it is too short for so many."""
     splits: list[Folds] = []
-    if len(log.runs) >= _MANY_RUNS:
-        splits = _deals_of_runs(log, past, steps)
+    if len(log.runs) >= max(_MANY_RUNS, count):
+        splits = _deals_of_runs(log, count, past, steps)
     best_deal = _best(splits)
     if best_deal is not None and best_deal.coverage >= 1 - 5 * _NEARLY:
         return best_deal
     for blocks in _BLOCKS:
-        folds = _blocks(log, blocks, past, steps)
+        folds = _blocks(log, count, blocks, past, steps)
         if folds is not None:
             splits.append(folds)
-    best = _best(splits)
-    if best is None:
-        return _halves(log)
-    return best
+    return _best(splits)
 
 
 def _best(splits: list[Folds]) -> Folds | None:
@@ -88,71 +104,103 @@ def _best(splits: list[Folds]) -> Folds | None:
     return next(split for split in splits if split.coverage >= most - _NEARLY)
 
 
-def _deals_of_runs(log: Log, past: int, steps: int) -> list[Folds]:
-    """Returns ways to deal whole runs to two folds, the best one alone."""
+def _deals_of_runs(log: Log, folds: int, past: int, steps: int) -> list[Folds]:
+    """Returns ways to deal whole runs to folds, the best one alone."""
     runs = sorted(log.runs, key=len)
     count = len(runs)
+    deals = [tuple(tuple(range(first, count, folds)) for first in range(folds))]
+    if folds == 2:
+        for half in _deals(count):
+            deals.append((half, tuple(i for i in range(count) if i not in half)))
     splits = []
-    for deal in _deals(count):
-        first = tuple(runs[i] for i in deal)
-        second = tuple(runs[i] for i in range(count) if i not in deal)
-        folds = _folds(
-            log, (first, second), (first, second), f"{count} runs, dealt to two folds"
-        )
-        if _is_usable(folds, past, steps):
-            splits.append(folds)
+    for deal in deals:
+        held_out = [tuple(runs[i] for i in own) for own in deal]
+        train = [
+            tuple(run for other in held_out if other is not own for run in other)
+            for own in held_out
+        ]
+        words = f"{count} runs, dealt to {_COUNTS[folds]} folds"
+        dealt = _folds(log, held_out, train, words)
+        if _is_usable(dealt, past, steps):
+            splits.append(dealt)
     return sorted(splits, key=lambda folds: -folds.coverage)[:1]
 
 
 def _deals(count: int) -> list[tuple[int, ...]]:
-    """Returns the first fold's runs of some deals, alternating ones first.
+    """Returns the first fold's runs of some deals to two folds.
 
-    The others are all deals, or of many some by chance: the first ones in any order
-    would be alike. The first run is in the second fold, as every deal has a mirror
-    image.
+    They are all deals, or of many some by chance: the first ones in any order would be
+    alike. The first run is in the second fold, as every deal has a mirror image.
     """
-    alternating = tuple(range(0, count, 2))
     size = count // 2
     if math.comb(count - 1, size) <= _DEALS:
-        return [alternating, *itertools.combinations(range(1, count), size)]
+        return list(itertools.combinations(range(1, count), size))
     rng = np.random.default_rng(0)
     drawn = [1 + rng.permutation(count - 1)[:size] for _ in range(_DEALS)]
-    return [alternating, *(tuple(sorted(deal.tolist())) for deal in drawn)]
+    return [tuple(sorted(deal.tolist())) for deal in drawn]
 
 
-def _blocks(log: Log, count: int, past: int, steps: int) -> Folds | None:
+def _blocks(log: Log, folds: int, count: int, past: int, steps: int) -> Folds | None:
     """Returns folds of blocks that take turns; None where these are too short."""
     window = past + steps
     length = len(log) / count
     gap = min(window, int(length / _GAP_SHARE), (int(length) - window - 1) // 2)
     if gap < 0:
         return None
-    held_out: tuple[list[LogRun], list[LogRun]] = ([], [])
-    train: tuple[list[LogRun], list[LogRun]] = ([], [])
-    number = 0
-    for run in log:
-        cuts = _cuts(run, length)
-        for begin, end in itertools.pairwise(cuts):
-            name = f"block {number + 1}"
-            fold = number % 2
-            held_out[fold].append(run.part(begin, end, name))
-            first = begin + gap * (begin > 0)
-            last = end - gap * (end < len(run))
-            train[fold].append(run.part(first, last, name))
-            number += 1
-    if number < 2:
+    blocks = _blocks_of_runs(log, folds, length)
+    if len(blocks) < folds:
+        return None
+    held_out: list[tuple[LogRun, ...]] = []
+    train: list[tuple[LogRun, ...]] = []
+    for fold in range(folds):
+        own = [block for block in blocks if block.fold == fold]
+        held_out.append(tuple(block.rows for block in own))
+        train.append(tuple(_between(log, own, gap)))
+    if not all(train):
         return None
     words = (
-        f"{number} blocks of {length * log.time_step:.3g} s that take turns, "
-        f"{gap * log.time_step:.3g} s left out of the training rows at their ends"
+        f"{len(blocks)} blocks of {length * log.time_step:.3g} s that take turns in "
+        f"{_COUNTS[folds]} folds, {gap * log.time_step:.3g} s left out of the training "
+        "rows at their ends"
     )
-    folds = _folds(
-        log,
-        (tuple(held_out[0]), tuple(held_out[1])),
-        (tuple(train[0]), tuple(train[1])),
-        words,
-    )
-    return folds if _is_usable(folds, past, steps) else None
+    split = _folds(log, held_out, train, words)
+    return split if _is_usable(split, past, steps) else None
+
+
+class _Block(NamedTuple):
+    """A part of a run that one fold holds out."""
+
+    rows: LogRun
+    run: int  # number of the run that it is of
+    begin: int  # its first row there
+    end: int  # the row after its last one
+    fold: int
+
+
+def _blocks_of_runs(log: Log, folds: int, length: float) -> list[_Block]:
+    """Cuts runs into blocks of about a length, which take turns to be held out."""
+    blocks: list[_Block] = []
+    for number, run in enumerate(log):
+        for begin, end in itertools.pairwise(_cuts(run, length)):
+            rows = run.part(begin, end, f"block {len(blocks) + 1}")
+            blocks.append(_Block(rows, number, begin, end, len(blocks) % folds))
+    return blocks
+
+
+def _between(log: Log, held_out: list[_Block], gap: int) -> list[LogRun]:
+    """Returns the rows of a log that are held out by no block, nor near to one."""
+    between = []
+    for number, run in enumerate(log):
+        begin = 0
+        for block in held_out:
+            if block.run != number:
+                continue
+            if block.begin - gap > begin:
+                between.append(run.part(begin, block.begin - gap, f"from {begin}"))
+            begin = block.end + gap
+        if begin < len(run):
+            between.append(run.part(begin, len(run), f"from {begin}"))
+    return between
 
 
 def _cuts(run: LogRun, length: float) -> list[int]:
@@ -173,38 +221,42 @@ def _cuts(run: LogRun, length: float) -> list[int]:
 def _halves(log: Log) -> Folds:
     """Returns folds of the first and the second half of every run."""
     first, second = log.split_by_time(0.5)
-    runs = (first.runs, second.runs)
-    return _folds(log, runs, runs, "two halves by time: the log is too short for more")
+    return _folds(
+        log,
+        held_out=[first.runs, second.runs],
+        train=[second.runs, first.runs],
+        words="two halves by time: the log is too short for more",
+    )
 
 
 def _folds(
     log: Log,
-    held_out: tuple[tuple[LogRun, ...], tuple[LogRun, ...]],
-    train: tuple[tuple[LogRun, ...], tuple[LogRun, ...]],
+    held_out: Sequence[tuple[LogRun, ...]],
+    train: Sequence[tuple[LogRun, ...]],
     words: str,
 ) -> Folds:
-    """Returns the folds of two parts of a log, each fitted to where the other is not.
+    """Returns folds of runs.
 
     Args:
         log: That the runs are of.
-        held_out: Runs of both parts, when they are held out.
-        train: Likewise, when models are fitted to them.
+        held_out: Runs that each fold holds out.
+        train: Runs that its models are fitted to; none where it is of no use.
         words: How the log was split.
     """
-    pair = (
-        Fold(replace(log, runs=train[1]), replace(log, runs=held_out[0])),
-        Fold(replace(log, runs=train[0]), replace(log, runs=held_out[1])),
+    parts = tuple(
+        Fold(replace(log, runs=others), replace(log, runs=own))
+        for own, others in zip(held_out, train, strict=True)
     )
-    return Folds(pair, words, min(_coverage(fold) for fold in pair))
+    return Folds(parts, words, min(_coverage(fold) for fold in parts))
 
 
 def _is_usable(folds: Folds, past: int, steps: int) -> bool:
-    """Returns whether both folds have windows, and neither has few rows."""
-    rows = [len(fold.held_out) for fold in folds.pair]
-    if min(rows) < _BALANCED * sum(rows):
+    """Returns whether all folds have windows, and none has few rows."""
+    rows = [len(fold.held_out) for fold in folds.parts]
+    if min(rows) < _BALANCED * np.mean(rows):
         return False
     try:
-        for fold in folds.pair:
+        for fold in folds.parts:
             fold.train.windows(steps, past, most=1)
             fold.held_out.windows(steps, past, most=1)
     except DataError:

@@ -73,8 +73,8 @@ def learn(
     """Learns a model of the outputs behind a log.
 
     Args:
-        log: Of one run at least. Four runs or more are dealt to two folds, the blocks
-            of fewer take turns.
+        log: Of one run at least. Four runs or more are dealt to folds, the blocks of
+            fewer take turns.
         points: Rows that a GP is trained on, chosen by k-means.
         steps: Of the rollouts.
         seed: Of every random number.
@@ -107,7 +107,7 @@ def learn(
     progress(folds.sentence)
     search = Search(
         log=log,
-        folds=folds.pair,
+        folds=folds.parts,
         points=points,
         steps=steps,
         seed=seed,

@@ -23,6 +23,7 @@ def train_output_gp(
     rows: int,
     points: int,
     seed: int,
+    sees_memory: bool = False,
 ) -> OutputGP:
     """Trains a GP on the residual of the nominal part of a model.
 
@@ -34,14 +35,18 @@ def train_output_gp(
             of the row in the middle.
         points: Rows that the GP is trained on.
         seed: Of the choice of rows, and of the training.
+        sees_memory: Whether it sees the regressors of the memory.
     """
-    features, residuals = _mean_residuals(model, log, rows)
+    features, residuals = _mean_residuals(model, log, rows, sees_memory)
     chosen = choose_rows(features, points, seed)
     targets = np.ascontiguousarray(residuals[chosen][:, list(outputs)])
+    names = model.kinematics.feature_names(
+        log.mapping.column_names("inputs"), log.mapping.column_names("context")
+    )
+    if sees_memory:
+        names = [f"regressor {i + 1}" for i in range(features.shape[1])]
     columns = Columns(
-        features=model.kinematics.feature_names(
-            log.mapping.column_names("inputs"), log.mapping.column_names("context")
-        ),
+        features=names,
         outputs=[model.kinematics.output_names[output] for output in outputs],
     )
     trainer = Trainer(predicts="value", scaling=standardize, restarts=1, tolerance=1e-6)
@@ -53,13 +58,15 @@ def train_output_gp(
         seed,
         columns=columns,
     )
-    return OutputGP(outputs, training.posterior)
+    return OutputGP(outputs, training.posterior, sees_memory)
 
 
-def _mean_residuals(model: LogModel, log: Log, rows: int) -> tuple[Array, Array]:
-    """Computes residuals averaged over some rows (N, o), with features (N, d).
+def _mean_residuals(
+    model: LogModel, log: Log, rows: int, sees_memory: bool
+) -> tuple[Array, Array]:
+    """Computes residuals averaged over some rows (N, o), with what a GP sees (N, d).
 
-    The features are those of the row in the middle.
+    It sees the features of the row in the middle, or the regressors of its memory.
     """
     windows = log.windows(rows, past=model.past)
     start = windows.past
@@ -74,24 +81,25 @@ def _mean_residuals(model: LogModel, log: Log, rows: int) -> tuple[Array, Array]
     nominal = model.nominal_outputs(states, inputs, context)
     residuals = outputs - nominal
     features = kinematics.features(states, inputs, context)
-    linear = 0.0
+    seen = features
     if model.weights.size:
-        linear = _linear_term(model, windows, features, residuals)
-    residuals = (residuals - linear).mean(axis=1)
-    return features[:, rows // 2], residuals
+        regressors = _regressors(model, windows, features, residuals)
+        residuals = residuals - regressors @ model.weights.T
+        if sees_memory:
+            seen = regressors[..., :-1]
+    return seen[:, rows // 2], residuals.mean(axis=1)
 
 
-def _linear_term(
+def _regressors(
     model: LogModel, windows: Windows, features: Array, residuals: Array
 ) -> Array:
-    """Computes the linear term (N, rows, o) along rows that were measured."""
+    """Computes the regressors (N, rows, r) along rows that were measured."""
     remembered = model.parts(model.recall(windows), windows.inputs.shape[-1]).memory
-    terms = []
+    regressors = []
     for k in range(features.shape[1]):
-        regressors = model.memory.regressors(features[:, k], remembered)
-        terms.append(regressors @ model.weights.T)
+        regressors.append(model.memory.regressors(features[:, k], remembered))
         remembered = model.memory.step(remembered, features[:, k], residuals[:, k])
-    return np.stack(terms, axis=1)
+    return np.stack(regressors, axis=1)
 
 
 def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:

@@ -6,8 +6,9 @@ and step: each run, or block of one, is corrected by what the others say. The be
 comes first, then, one by one, that with which the mean is best (Caruana et al., 2004,
 Ensemble selection from libraries of models). Each run counts alike, by its errors over
 those of the ridge regression there: the runs to come may be like any of them. What is
-chosen on a few runs is chosen by chance as well, so that up to a half of the average is
-the ridge regression where that costs next to nothing.
+chosen on a few runs is chosen by chance as well: of it as much is taken as the gains of
+single runs agree, and up to a half of the average is the ridge regression where that
+costs next to nothing.
 """
 
 from collections.abc import Sequence
@@ -153,8 +154,37 @@ def _choose_shares(errors: Array, runs: np.ndarray) -> Array:
         least = scores[best]
         counts[best] += 1
         total = total + errors[best]
-    shares = counts / counts.sum()
+    shares = _without_chance(counts / counts.sum(), errors, runs, weights)
     return _with_ridge(shares, errors, weights)
+
+
+def _without_chance(
+    shares: Array, errors: Array, runs: np.ndarray, weights: Array
+) -> Array:
+    """Moves shares (A,) to the rollout as it is, as far as the runs' gains disagree.
+
+    With g the mean gain of a run and s its standard error, g^2 / (g^2 + s^2) of them
+    stays.
+
+    Args:
+        shares: That were chosen (A,).
+        errors: (A, W, e), those of the rollout as it is first.
+        runs: Number of the run of each window (W,).
+        weights: Of the windows (W,).
+    """
+    lengths = np.linalg.norm(errors[0], axis=-1)
+    gains = lengths - np.linalg.norm(_average(shares, errors), axis=-1)
+    by_run = np.bincount(np.unique(runs, return_inverse=True)[1], weights * gains)
+    gain = by_run.mean()
+    if gain <= 0:
+        return np.eye(1, len(shares))[0]
+    if len(by_run) < 2:
+        return shares
+    variance = by_run.var(ddof=1) / len(by_run)
+    kept = gain**2 / (gain**2 + variance)
+    moved = kept * shares
+    moved[0] += 1 - kept
+    return moved
 
 
 def _with_ridge(shares: Array, errors: Array, weights: Array) -> Array:

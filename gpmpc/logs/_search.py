@@ -8,7 +8,8 @@
 4. A correction by the past upon the best structure.
 
 A structure's score is the mean, over groups and steps, of the logarithm of its error
-over that of the best baseline; where it is behind, that counts twice.
+over that of the best baseline; where it is behind, that counts twice. A simulation of
+hundreds of steps, over the spread of what is simulated, counts as one step more.
 """
 
 from collections.abc import Iterable, Mapping, MutableMapping, Sequence
@@ -24,6 +25,7 @@ from gpmpc.logs._comparison import Comparison, compare
 from gpmpc.logs._fit_form import fit_from
 from gpmpc.logs._fitting import NominalFit
 from gpmpc.logs._folds import Fold
+from gpmpc.logs._free_simulation import FreeSimulation
 from gpmpc.logs._log import Log
 from gpmpc.logs._noise import fit_noise
 from gpmpc.logs._output_gps import train_output_gp
@@ -33,6 +35,7 @@ from gpmpc.logs._rollout_corrections import (
     fit_correction,
 )
 from gpmpc.logs._smoothing import smooth
+from gpmpc.logs._stability import grows_outside
 from gpmpc.logs._structures import (
     MOST_PAST,
     Candidate,
@@ -43,6 +46,7 @@ from gpmpc.logs._structures import (
 )
 from gpmpc.models._correction import StartFilter
 from gpmpc.models._grouped import GroupedNominal
+from gpmpc.models._kinematics import RigidBodyKinematics
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel, OutputGP
 from gpmpc.models._parametric import AffineNominal
@@ -54,13 +58,16 @@ _JUDGED = (1, 10, 50)  # steps whose errors decide
 _PIECE = 0.02  # of the score that every piece of a structure has to earn
 _BEAM = 2  # structures that go on, of a round
 _CLOSE = 0.02  # of the best score: where the second one goes on as well
-_WINDOWS = 200  # of a fold, that structures are compared on
+_WINDOWS = 400  # that structures are compared on
 _CORRECTED_WINDOWS = 2400  # that a correction is fitted to
 _LARGEST = 1e6  # state of a rollout that a correction is fitted to
 _FILTERED_WINDOWS = 4000  # that the filter of starts is fitted to
 _FILTER_PENALTY = 1e-4  # of squared coefficients of the filter of starts, per row
+_ROWS_SEEN = 8  # most past rows that a GP sees
 _EXACT = 1e-4  # of a constant state's error: what is smaller counts as exact
 _NOTHING = 1e-9  # of the outputs: a residual that is none
+_OUT_OF_REACH = 0.5  # mean logarithm by which rollouts are too bad to be simulated
+_UNSTABLE = 10.0  # of the score of what grows without bounds outside of its data
 _LOSS = 2.0  # weight of being behind a baseline
 _ROUNDS = 8  # of changes of the GPs of one nominal structure, at most
 
@@ -117,7 +124,7 @@ class Search:
         self._bases = bases(log)
         self.judged_steps = tuple(sorted({min(step, steps) for step in _JUDGED}))
         self._windows = [
-            fold.held_out.windows(steps, past=PAST_ROWS, most=_WINDOWS)
+            fold.held_out.windows(steps, past=PAST_ROWS, most=_WINDOWS // len(folds))
             for fold in folds
         ]
         self._nominal_models: dict[str, list[LogModel]] = {}
@@ -131,6 +138,13 @@ class Search:
         still = self._baselines[CONSTANT_STATE].mean(axis=0)
         self._exact = _EXACT * still + 1e-12
         self._scale = self._best_baseline_errors()
+        self._simulation: FreeSimulation | None = None
+        if not for_control:
+            self._simulation = FreeSimulation.of(folds, PAST_ROWS, steps)
+        self._simulated: dict[str, Array] = {}
+        self._best_logarithm = np.inf  # mean of the errors of rollouts, over baselines
+        self._unstable: set[str] = set()  # keys of nominal structures
+        self._fits: dict[str, NominalFit] = {}  # to all rows, without corrections
 
     @property
     def best(self) -> Structure:
@@ -158,15 +172,26 @@ class Search:
         self._search_combinations()
         for start in self._starts_of_gps():
             self._search_gps(start)
-        if not self._for_control:
+        for start in self._starts_of_gps_of_past():
+            self._search_gps_of_past(start)
+        if self._for_control:
+            return
+        self._consider_correction(self.best)
+        # What is stable by half of the rows need not be so by all.
+        while self._marks_as_unstable(self.best, [self._fit_of_all(self.best).model]):
             self._consider_correction(self.best)
 
     def score(self, structure: Structure) -> float:
         """Returns the score of a structure that was considered; smaller is better."""
         errors = np.maximum(self._errors[structure.key], self._exact)
         logarithms = np.log(errors / self._scale)
+        simulated = self._simulated[structure.uncorrected.key]
+        if len(simulated):
+            logarithms = np.vstack([logarithms, simulated])
         behind = np.maximum(logarithms, 0.0)
         total = logarithms.mean() + (_LOSS - 1) * behind.mean()
+        if structure.nominal.key in self._unstable:
+            total += _UNSTABLE
         return float(total) + _PIECE * structure.size
 
     def _ranked(self, structures: Iterable[Structure]) -> list[Structure]:
@@ -279,7 +304,8 @@ class Search:
             )
         ]
         self._nominal_models[structure.key] = models
-        self._enter(structure, self._mean_errors(models))
+        self._marks_as_unstable(structure, models)
+        self._measure(structure, models)
 
     # 2. combinations of groups of outputs
 
@@ -336,7 +362,7 @@ class Search:
             return None
         structure = Structure("", models[0], parts[0][0].inputs, parts=parts)
         self._nominal_models[structure.key] = models
-        self._enter(structure, self._mean_errors(models))
+        self._measure(structure, models)
         return structure
 
     # 3. GPs
@@ -349,7 +375,8 @@ class Search:
         ranked = self._ranked(self._structures.values())
         # Of those without a memory, GPs see rows without noise.
         plain = [one for one in ranked if one.model.memory.empty]
-        starts = [*ranked[:1], *[one for one in plain[:1] if one is not ranked[0]]]
+        starts = [one for one in ranked[:1] if one.model.memory.products is None]
+        starts += [one for one in plain[:1] if one is not ranked[0]]
         keys = [start.key for start in starts]
         for base in self._bases:
             nominal = base.model.nominal
@@ -374,6 +401,42 @@ class Search:
                 if best is current:
                     break
                 current = best
+
+    def _starts_of_gps_of_past(self) -> list[Structure]:
+        """Returns the nominal structures on which GPs of past rows are tried.
+
+        They remember few numbers: a GP is a poor function of many.
+        """
+        if isinstance(self._bases[0].model.kinematics, RigidBodyKinematics):
+            return []
+        starts = []
+        for structure in self._ranked(self._structures.values()):
+            model = structure.model
+            seen = model.memory.copies
+            is_plain = not (structure.gps or structure.parts or model.memory.products)
+            if 0 < seen <= _ROWS_SEEN and is_plain:
+                starts.append(structure)
+        return starts[:_BEAM]
+
+    def _search_gps_of_past(self, start: Structure) -> None:
+        """Adds GPs of past rows to one group of outputs after the other."""
+        groups = self._groups_with_residual(start)
+        current = start
+        for _ in range(_ROUNDS):
+            with_gp = {gp.group for gp in current.gps}
+            changed = [
+                current.with_gps([*current.gps, GroupGP(group, 1, sees_past=True)])
+                for group in groups
+                if group not in with_gp
+            ]
+            if not changed:
+                return
+            for structure in changed:
+                self._consider_gps(structure)
+            best = self._ranked(changed)[0]
+            if self.score(best) > self.score(current):
+                return
+            current = best
 
     def _averaged_least(self, start: Structure, groups: Sequence[str]) -> Structure:
         """Returns the structure with GPs on all groups, averaged over the best rows.
@@ -423,9 +486,13 @@ class Search:
         """Considers a structure with GPs."""
         if structure.key in self._structures:
             return
-        if structure.key not in self._memory:
-            errors = self._mean_errors(self._models(structure))
-            self._memory[structure.key] = errors.tolist()
+        key = f"simulation of {structure.key}"
+        if key not in self._memory:
+            models = self._models(structure)
+            self._memory[structure.key] = self._mean_errors(models).tolist()
+            errors = np.array(self._memory[structure.key])
+            self._memory[key] = self._simulate(models, errors).tolist()
+        self._simulated[structure.key] = np.array(self._memory[key])
         self._enter(structure, np.array(self._memory[structure.key]))
 
     # 4. corrections by the past
@@ -436,6 +503,8 @@ class Search:
         A structure has none whose rollouts diverge on all that a model was not fitted
         to.
         """
+        if structure.shares:
+            return
         key = f"averages of {structure.key}"
         if key not in self._memory:
             parts = [one.rollouts for one in self._validate(structure)]
@@ -466,17 +535,26 @@ class Search:
         """
         structure = replace(structure, shares=())
         if structure.key not in self._validations:
-            try:
-                folds = self._quarters()
-                models = [self._fit_to(fold.train, structure).model for fold in folds]
-            except DataError:
-                folds = list(self._folds)
-                models = self._models(structure)
+            folds, models = self._validation_models(structure)
             self._validations[structure.key] = [
                 _Validation(fold.held_out, model, self._rollouts(model, fold.held_out))
                 for fold, model in zip(folds, models, strict=True)
             ]
         return self._validations[structure.key]
+
+    def _validation_models(
+        self, structure: Structure
+    ) -> tuple[Sequence[Fold], list[LogModel]]:
+        """Returns folds with three quarters to fit to, if there are rows enough."""
+        if len(self._folds) == 2:
+            try:
+                folds = self._quarters()
+                return folds, [
+                    self._fit_to(fold.train, structure).model for fold in folds
+                ]
+            except DataError:
+                pass
+        return self._folds, self._models(structure)
 
     def _quarters(self) -> list[Fold]:
         """Halves what each fold holds out, every other run or block of it.
@@ -526,6 +604,39 @@ class Search:
 
     # what all of them need
 
+    def _marks_as_unstable(
+        self, structure: Structure, models: Sequence[LogModel]
+    ) -> bool:
+        """Marks a structure one of whose models grows outside of its data; says so."""
+        inputs = len(self._log.input_names)
+        time_step = self._log.time_step
+        is_unstable = any(grows_outside(model, inputs, time_step) for model in models)
+        if is_unstable:
+            self._unstable.add(structure.nominal.key)
+        return is_unstable
+
+    def _measure(self, structure: Structure, models: Sequence[LogModel]) -> None:
+        """Enters a nominal structure with the errors of its models."""
+        errors = self._mean_errors(models)
+        key = f"simulation of {structure.key}"
+        if key not in self._memory:
+            self._memory[key] = self._simulate(models, errors).tolist()
+        self._simulated[structure.key] = np.array(self._memory[key])
+        self._enter(structure, errors)
+
+    def _simulate(self, models: Sequence[LogModel], errors: Array) -> Array:
+        """Simulates long held-out rows; returns the logarithms of errors (g,), or none.
+
+        Of models whose rollouts are far from the best ones the worst is taken.
+        """
+        if self._simulation is None:
+            return np.empty(0)
+        logarithm = np.log(np.maximum(errors, self._exact) / self._scale).mean()
+        self._best_logarithm = min(self._best_logarithm, logarithm)
+        if logarithm > self._best_logarithm + _OUT_OF_REACH:
+            return self._simulation.worst_logarithms
+        return self._simulation.logarithms(models)
+
     def _enter(self, structure: Structure, errors: Array) -> None:
         """Enters a candidate with its errors."""
         self._structures[structure.key] = structure
@@ -550,10 +661,10 @@ class Search:
             self._rollouts(model, fold.held_out)
             for model, fold in zip(models, self._folds, strict=True)
         ]
-        # What one fold holds out, the model of the other was fitted to.
+        # What one fold holds out, the models of the others were fitted to.
         return [
-            self._correct(model, structure, [others])
-            for model, others in zip(models, reversed(rollouts), strict=True)
+            self._correct(model, structure, rollouts[:i] + rollouts[i + 1 :])
+            for i, model in enumerate(models)
         ]
 
     def _trained(self, structure: Structure, gp: GroupGP) -> list[OutputGP]:
@@ -578,6 +689,7 @@ class Search:
             rows=gp.rows,
             points=self._points,
             seed=self._seed,
+            sees_memory=gp.sees_past,
         )
 
     def _distances(self, models: Sequence[LogModel]) -> Array:
@@ -656,9 +768,16 @@ class Search:
 
     def fit_to_all_runs(self) -> NominalFit:
         """Fits the best structure to all runs, its GPs and its correction as well."""
-        fit = self._fit_to(self._log, self.best)
+        fit = self._fit_of_all(self.best)
         rollouts = [validation.rollouts for validation in self._validate(self.best)]
         return replace(fit, model=self._correct(fit.model, self.best, rollouts))
+
+    def _fit_of_all(self, structure: Structure) -> NominalFit:
+        """Fits a structure to all runs, without its correction, once."""
+        key = structure.uncorrected.key
+        if key not in self._fits:
+            self._fits[key] = self._fit_to(self._log, structure)
+        return self._fits[key]
 
     def _fit_to(self, log: Log, structure: Structure) -> NominalFit:
         """Fits a structure to a log, without its correction."""

@@ -29,7 +29,7 @@ from gpmpc.logs._log import Log
 from gpmpc.logs._system_structures import system_nominal
 from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
 from gpmpc.models._log_model import LogModel
-from gpmpc.models._memory import Memory
+from gpmpc.models._memory import Memory, Products
 from gpmpc.models._parametric import AffineNominal, MultirotorNominal
 from gpmpc.models._system_nominal import SystemNominal
 
@@ -44,8 +44,15 @@ _MEMORIES = {
         Memory(3, (0.75, 0.9, 0.95), (0.0, 0.5, 0.8, 0.95)),
     ),
     "rows2": ("2 past rows", Memory(2)),
-    "rows8": ("8 past rows", Memory(8, (), (0.0, 0.5, 0.8, 0.95))),
+    "rows4": ("4 past rows", Memory(4)),
+    "rows7": ("7 past rows", Memory(7)),
+    "rows14": ("14 past rows", Memory(14)),
+    "rows8": ("8 past rows and means of outputs", Memory(8, (), (0.0, 0.5, 0.8, 0.95))),
 }
+# Rows whose features are multiplied, and most factors: the first that are few enough.
+_PRODUCTS = ((2, 3), (2, 2), (1, 3), (1, 2))
+_MOST_PRODUCTS = 36
+_COUNTS = {2: "two", 3: "three"}
 # Rows before a start that any structure needs.
 MOST_PAST = max(PAST, *(memory.reach for _, memory in _MEMORIES.values())) + LATE + 1
 
@@ -75,6 +82,20 @@ class GroupGP(NamedTuple):
 
     group: str
     rows: int  # over which its targets are averaged
+    sees_past: bool = False  # whether it is a function of the past rows as well
+
+    @property
+    def words(self) -> str:
+        """The GP in words."""
+        if self.sees_past:
+            return f"{self.group} (of past rows)"
+        return f"{self.group} (averaged over {self.rows})"
+
+    @property
+    def key(self) -> str:
+        """The GP in the memory of a search."""
+        past = ":past" if self.sees_past else ""
+        return f"gp:{self.group}:{self.rows}{past}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +105,8 @@ class Structure:
     base: str  #: that it grew from, such as "rigid body"
     model: LogModel  #: nominal part, history and lag
     inputs: int  #: number of inputs
+    #: smallest and largest features in the log (2, d); empty where no term needs them
+    ranges: tuple[tuple[float, ...], ...] = ()
     additions: tuple[Addition, ...] = ()
     gps: tuple[GroupGP, ...] = ()
     #: structures without GPs, each with the groups of outputs that are its own; none of
@@ -100,8 +123,7 @@ class Structure:
         if self.parts:
             words = [f"{part.name} for {_words(groups)}" for part, groups in self.parts]
         if self.gps:
-            gps = [f"{gp.group} (averaged over {gp.rows})" for gp in self.gps]
-            words.append(f"GP on {_words(gps)}")
+            words.append(f"GP on {_words([gp.words for gp in self.gps])}")
         if self.shares:
             words.append("corrected by the past")
         return ", ".join(words)
@@ -112,7 +134,7 @@ class Structure:
         words = [self.base, *sorted(addition.key for addition in self.additions)]
         for part, groups in self.parts:
             words.append(f"({part.key}:{'+'.join(groups)})")
-        words += sorted(f"gp:{gp.group}:{gp.rows}" for gp in self.gps)
+        words += sorted(gp.key for gp in self.gps)
         if self.shares:
             words.append("corrected")
         return "/".join(words)
@@ -127,6 +149,11 @@ class Structure:
     def nominal(self) -> "Structure":
         """The structure without GPs and correction."""
         return replace(self, gps=(), shares=())
+
+    @property
+    def uncorrected(self) -> "Structure":
+        """The structure without its correction."""
+        return replace(self, shares=())
 
     def extended(self, addition: Addition) -> "Structure | None":
         """Returns the structure with an addition; None where that makes no sense."""
@@ -154,7 +181,8 @@ def bases(log: Log) -> list[Structure]:
         body = RigidBodyKinematics(log.space)
         return [_multirotor_base(log), *_affine_bases(body, len(log.input_names))]
     kinematics = Increments(log.space)
-    affine_bases = _affine_bases(kinematics, len(log.input_names))
+    ranges = _ranges_of_features(kinematics, log)
+    affine_bases = _affine_bases(kinematics, len(log.input_names), ranges)
     nominal = system_nominal(log)
     if nominal is None:
         return affine_bases
@@ -188,7 +216,24 @@ def _multirotor_base(log: Log) -> Structure:
     return Structure("rigid body", model, len(log.input_names))
 
 
-def _affine_bases(kinematics: Kinematics, inputs: int) -> list[Structure]:
+def _ranges_of_features(
+    kinematics: Kinematics, log: Log
+) -> tuple[tuple[float, ...], ...]:
+    """Returns the smallest and the largest features of all rows (2, d).
+
+    Beside a context there is none: no product has it as a factor.
+    """
+    if log.mapping.of("context"):
+        return ()
+    features = np.concatenate(
+        [kinematics.features(run.states, run.inputs, run.context) for run in log]
+    )
+    return tuple(features.min(axis=0).tolist()), tuple(features.max(axis=0).tolist())
+
+
+def _affine_bases(
+    kinematics: Kinematics, inputs: int, ranges: tuple[tuple[float, ...], ...] = ()
+) -> list[Structure]:
     """Returns outputs of zero, and outputs that are affine in the features."""
     names = {False: "constant state", True: "least squares"}
     if isinstance(kinematics, RigidBodyKinematics):
@@ -203,6 +248,7 @@ def _affine_bases(kinematics: Kinematics, inputs: int) -> list[Structure]:
                 history=(0,) * len(kinematics.output_names),
             ),
             inputs,
+            ranges,
         )
         for fitted, name in names.items()
     ]
@@ -220,7 +266,8 @@ def additions(structure: Structure) -> tuple[Addition, ...]:
     if isinstance(structure.model.nominal, MultirotorNominal):
         alone = _alone_additions(structure.model)
         return (*_MULTIROTOR_ADDITIONS, *_BODY_ADDITIONS, lags, *alone)
-    return (*_AFFINE_ADDITIONS, *_MEMORY_ADDITIONS, lags, _REFINED)
+    products = _product_additions(structure)
+    return (*_AFFINE_ADDITIONS, *_MEMORY_ADDITIONS, *products, lags, _REFINED)
 
 
 def _median_voltage(log: Log) -> float:
@@ -234,12 +281,12 @@ def _median_voltage(log: Log) -> float:
 def _with_memory(memory: Memory) -> Callable[[LogModel], LogModel | None]:
     def extend(model: LogModel) -> LogModel | None:
         nominal = model.nominal
-        if not model.memory.empty:
+        has_affine_part = isinstance(nominal, AffineNominal) and nominal.fitted
+        # The linear term has all of an affine part: the same comes of a constant state.
+        if has_affine_part or not model.memory.empty:
             return None
-        if isinstance(nominal, AffineNominal) and nominal.fitted:
-            nominal = replace(nominal, fitted=False)  # the linear term has it all
         no_history = (0,) * len(model.history)
-        return replace(model, nominal=nominal, memory=memory, history=no_history)
+        return replace(model, memory=memory, history=no_history)
 
     return extend
 
@@ -250,8 +297,36 @@ _MEMORY_ADDITIONS = tuple(
 )
 
 
-# Few rows are enough of few signals alone.
-_BODY_ADDITIONS = tuple(one for one in _MEMORY_ADDITIONS if one.key != "rows2")
+# Rows alone are enough of few signals, whose outputs have no physics.
+_BODY_ADDITIONS = tuple(
+    one for one in _MEMORY_ADDITIONS if one.key in ("rows_and_means", "rows8")
+)
+
+
+def _product_additions(structure: Structure) -> list[Addition]:
+    """Returns products of the last features, the most that are not too many."""
+    if not structure.ranges:
+        return []
+    low, high = structure.ranges
+    for rows, degree in _PRODUCTS:
+        products = Products(rows, degree, low, high)
+        if len(products.factors) <= _MOST_PRODUCTS:
+            words = f"products of {_COUNTS[degree]}"
+            addition = Addition("products", words, _with_products(products), False)
+            return [addition]
+    return []
+
+
+def _with_products(products: Products) -> Callable[[LogModel], LogModel | None]:
+    def extend(model: LogModel) -> LogModel | None:
+        memory = model.memory
+        if memory.products is not None or not 0 < memory.rows >= products.rows - 1:
+            return None
+        if len(model.time_constants):
+            return None
+        return replace(model, memory=replace(memory, products=products))
+
+    return extend
 
 
 def _with_refined_term(model: LogModel) -> LogModel | None:
@@ -298,7 +373,7 @@ def _with_lags(inputs: int) -> Callable[[LogModel], LogModel | None]:
         is_still = isinstance(nominal, AffineNominal) and not nominal.fitted
         if len(model.time_constants) or (is_still and model.memory.empty):
             return None
-        if inputs == 0:
+        if not inputs or model.memory.products is not None:  # which see their past
             return None
         return replace(model, time_constants=np.zeros(inputs))
 

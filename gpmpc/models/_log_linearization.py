@@ -7,6 +7,7 @@ only they are differentiated by central differences, all points in one batch.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -164,6 +165,11 @@ class LogLinearizer:
             by_regressors = model.weights
             by_features += by_regressors @ self._maps.regressors_by_features
             by_memory += by_regressors @ self._maps.regressors_by_memory
+            if model.memory.products is not None:
+                of_products = model.weights[:, self._maps.products]
+                slopes = model.memory.product_slopes(local.features, memory)
+                by_features += of_products @ slopes[0]
+                by_memory += of_products @ slopes[1]
         for gp in model.gps:
             prediction = _gp_prediction(gp, local.features, regressors, covariance)
             rows = list(gp.outputs)
@@ -224,8 +230,9 @@ class _LinearMaps(NamedTuple):
     carried_by_input: Array  # (c, m)
     carried_by_features: Array  # (c, d)
     carried_by_learned: Array  # (c, o)
-    regressors_by_features: Array  # (r, d)
-    regressors_by_memory: Array  # (r, s)
+    regressors_by_features: Array  # (r, d); zero of the products
+    regressors_by_memory: Array  # (r, s); likewise
+    products: slice  # rows of the products among the regressors
 
 
 class _MemoryMaps(NamedTuple):
@@ -234,8 +241,9 @@ class _MemoryMaps(NamedTuple):
     by_memory: Array  # next s by s (s, s)
     by_features: Array  # (s, d)
     by_learned: Array  # (s, o)
-    regressors_by_features: Array  # (r, d)
-    regressors_by_memory: Array  # (r, s)
+    regressors_by_features: Array  # (r, d); zero of the products
+    regressors_by_memory: Array  # (r, s); likewise
+    products: slice  # rows of the products among the regressors
 
 
 def _linear_maps(model: LogModel, m: int, time_step: float) -> _LinearMaps:
@@ -271,6 +279,7 @@ def _linear_maps(model: LogModel, m: int, time_step: float) -> _LinearMaps:
         carried_by_learned=np.vstack([np.zeros((first, o)), memory.by_learned]),
         regressors_by_features=memory.regressors_by_features,
         regressors_by_memory=memory.regressors_by_memory,
+        products=memory.products,
     )
 
 
@@ -286,9 +295,11 @@ def _memory_maps(model: LogModel, features: int, size: int) -> _MemoryMaps:
             by_learned=np.zeros((0, o)),
             regressors_by_features=np.eye(d),
             regressors_by_memory=np.zeros((d, 0)),
+            products=slice(0, 0),
         )
-    memory = model.memory
+    memory = replace(model.memory, products=None)
     one = memory.regressors(np.zeros(d), np.zeros(s))
+    products = model.memory.regressor_dim(d, o) - len(one)
     # The memory is linear, so that its values at unit vectors are its matrices.
     return _MemoryMaps(
         by_memory=_matrix(
@@ -300,13 +311,20 @@ def _memory_maps(model: LogModel, features: int, size: int) -> _MemoryMaps:
         by_learned=_matrix(
             lambda e: memory.step(np.zeros((o, s)), np.zeros((o, d)), e), o
         ),
-        regressors_by_features=_matrix(
-            lambda e: memory.regressors(e, np.zeros((d, s))) - one, d
+        regressors_by_features=_with_products(
+            _matrix(lambda e: memory.regressors(e, np.zeros((d, s))) - one, d), products
         ),
-        regressors_by_memory=_matrix(
-            lambda e: memory.regressors(np.zeros((s, d)), e) - one, s
+        regressors_by_memory=_with_products(
+            _matrix(lambda e: memory.regressors(np.zeros((s, d)), e) - one, s), products
         ),
+        products=slice(d + s, d + s + products),
     )
+
+
+def _with_products(by_others: Array, products: int) -> Array:
+    """Inserts rows of zeros for products, before that of the constant."""
+    zeros = np.zeros((products, by_others.shape[1]))
+    return np.vstack([by_others[:-1], zeros, by_others[-1:]])
 
 
 def _matrix(function: Callable[[Array], Array], size: int) -> Array:

@@ -10,9 +10,15 @@ means of features and of outputs,
 a filter bank of fixed poles (Heuberger, Van den Hof and Wahlberg, 2005). All of it is
 known from what was measured, so that nothing has to be estimated; in a rollout it is
 filled with what is predicted. Means of outputs are what a disturbance is estimated by.
+
+A linear term may see products of the last rows as well (polynomial NARX; Leontaritis
+and Billings, 1985). Their factors are clipped to the ranges of the data, so that
+outside of them nothing grows but what is linear.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -21,20 +27,114 @@ from gpmpc.exceptions import SettingError, check_number
 
 
 @dataclass(frozen=True)
+class Products:
+    """Products of the features of the last rows.
+
+    Raises:
+        SettingError: There are no rows or no factors, or the ranges do not fit.
+    """
+
+    rows: int  #: of which the features are factors, that of now among them
+    degree: int  #: most factors of a product; two or more
+    low: tuple[float, ...]  #: of each feature in the data (d,)
+    high: tuple[float, ...]  #: likewise
+
+    def __post_init__(self) -> None:
+        check_number("rows", self.rows, least=1, whole=True)
+        check_number("degree", self.degree, least=2, whole=True)
+        is_range = len(self.low) == len(self.high)
+        if not is_range or any(a > b for a, b in zip(self.low, self.high, strict=True)):
+            got = f"{self.low} and {self.high}"
+            raise SettingError("low", f"must be as many as high, none above; got {got}")
+
+    @cached_property
+    def factors(self) -> list[tuple[int, ...]]:
+        """Indices of the factors of each product among the rows' features."""
+        variables = range(self.rows * len(self.low))
+        return [
+            product
+            for degree in range(2, self.degree + 1)
+            for product in combinations_with_replacement(variables, degree)
+        ]
+
+    @cached_property
+    def _steps(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """How the products of each degree come from those of one less.
+
+        For each degree from two on, the indices of these and of the last factors.
+        """
+        variables = self.rows * len(self.low)
+        shorter: list[tuple[int, ...]] = [(i,) for i in range(variables)]
+        steps = []
+        for degree in range(2, self.degree + 1):
+            longer = [one for one in self.factors if len(one) == degree]
+            places = {factors: i for i, factors in enumerate(shorter)}
+            first = np.array([places[one[:-1]] for one in longer])
+            steps.append((first, np.array([one[-1] for one in longer])))
+            shorter = longer
+        return steps
+
+    def __call__(self, rows: Array) -> Array:
+        """Computes the products (..., p).
+
+        Args:
+            rows: Features of the last rows, that of now first (..., rows d).
+        """
+        scaled = self._scaled(rows)
+        columns = [scaled]
+        for first, last in self._steps:
+            columns.append(columns[-1][..., first] * scaled[..., last])
+        return np.concatenate(columns[1:], axis=-1)
+
+    def slopes(self, rows: Array) -> Array:
+        """Computes the derivatives (..., p, rows d) of the products by the rows."""
+        scaled = self._scaled(rows)
+        half, _ = self._scale
+        is_inside = np.abs(scaled) < 1
+        identity = np.eye(rows.shape[-1]) * (is_inside / half)[..., None]
+        values = [scaled]
+        slopes = [identity]
+        for first, last in self._steps:
+            by_first = slopes[-1][..., first, :] * scaled[..., last, None]
+            by_last = values[-1][..., first, None] * identity[..., last, :]
+            slopes.append(by_first + by_last)
+            values.append(values[-1][..., first] * scaled[..., last])
+        return np.concatenate(slopes[1:], axis=-2)
+
+    def _scaled(self, rows: Array) -> Array:
+        """Returns features within [-1, 1]."""
+        half, middle = self._scale
+        return np.clip((rows - middle) / half, -1.0, 1.0)
+
+    @cached_property
+    def _scale(self) -> tuple[Array, Array]:
+        """Half the ranges, and their middles, of the features of all rows (rows d,)."""
+        low = np.tile(self.low, self.rows)
+        high = np.tile(self.high, self.rows)
+        half = (high - low) / 2
+        return np.where(half > 0, half, 1.0), (high + low) / 2
+
+
+@dataclass(frozen=True)
 class Memory:
     """A filter bank over d features and o outputs.
 
     Raises:
-        SettingError: A number of rows is negative, or a decay is not within [0, 1).
+        SettingError: A number of rows is negative, a decay is not within [0, 1), or
+            products are of rows that are not remembered.
     """
 
     rows: int = 0  #: p, of which the features are remembered as they were
     #: a of each exponential mean of the features; a mean reaches over 1 / (1 - a) rows
     decays: tuple[float, ...] = ()
     output_decays: tuple[float, ...] = ()  #: likewise of the outputs
+    products: Products | None = None  #: of the last rows, for the linear term alone
 
     def __post_init__(self) -> None:
         check_number("rows", self.rows, least=0, whole=True)
+        if self.products is not None and self.products.rows > self.rows + 1:
+            rule = f"must be of {self.rows + 1} rows at most"
+            raise SettingError("products", f"{rule}; got {self.products.rows}")
         for decay in (*self.decays, *self.output_decays):
             if not 0 <= decay < 1:
                 raise SettingError("decays", f"must be within [0, 1); got {decay}")
@@ -63,7 +163,8 @@ class Memory:
 
     def regressor_dim(self, features: int, outputs: int) -> int:
         """Returns the number of regressors (see ``regressors``)."""
-        return features + self.dim(features, outputs) + 1
+        products = 0 if self.products is None else len(self.products.factors)
+        return features + self.dim(features, outputs) + products + 1
 
     def begin(self, features: Array, outputs: Array) -> Array:
         """Fills the memory with measured rows; means begin at the first one.
@@ -117,7 +218,7 @@ class Memory:
         """Returns the regressors (..., r) of a linear term.
 
         They are the features, their differences from those that are remembered, the
-        means of the outputs, and one.
+        means of the outputs, the products, and one.
         """
         d = features.shape[-1]
         copies = memory[..., : self.copies * d]
@@ -125,8 +226,34 @@ class Memory:
         differences = features[..., None, :] - copies
         flat = differences.reshape(*memory.shape[:-1], self.copies * d)
         output_means = memory[..., self.copies * d :]
-        one = np.ones((*memory.shape[:-1], 1))
-        return np.concatenate([features, flat, output_means, one], axis=-1)
+        columns = [features, flat, output_means]
+        if self.products is not None:
+            columns.append(self.products(self._factors(features, memory)))
+        columns.append(np.ones((*memory.shape[:-1], 1)))
+        return np.concatenate(columns, axis=-1)
+
+    def product_slopes(self, features: Array, memory: Array) -> tuple[Array, Array]:
+        """Computes the derivatives of the products, where the memory has some.
+
+        Args:
+            features: Of the present row (..., d).
+            memory: What is remembered (..., s).
+
+        Returns:
+            Those by the features (..., p, d) and by what is remembered (..., p, s).
+        """
+        assert self.products is not None
+        d = features.shape[-1]
+        slopes = self.products.slopes(self._factors(features, memory))
+        by_memory = np.zeros((*slopes.shape[:-1], memory.shape[-1]))
+        by_memory[..., : slopes.shape[-1] - d] = slopes[..., d:]
+        return slopes[..., :d], by_memory
+
+    def _factors(self, features: Array, memory: Array) -> Array:
+        """Returns the features of the last rows, that of now first (..., rows d)."""
+        assert self.products is not None
+        earlier = (self.products.rows - 1) * features.shape[-1]
+        return np.concatenate([features, memory[..., :earlier]], axis=-1)
 
 
 def _exponential_mean(rows: Array, decay: float) -> Array:

@@ -32,7 +32,7 @@ from gpmpc.models._grouped import GroupedNominal
 from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
 from gpmpc.models._log_dynamics import TIME_CONSTANTS, LogDynamics, OutputNoise
 from gpmpc.models._log_model import LogModel, OutputGP
-from gpmpc.models._memory import NO_MEMORY, Memory
+from gpmpc.models._memory import NO_MEMORY, Memory, Products
 from gpmpc.models._namings import NO_NAMINGS, Namings
 from gpmpc.models._older_files import STILL, namings_of_columns
 from gpmpc.models._parametric import AffineNominal, MultirotorNominal
@@ -55,6 +55,7 @@ _LONGEST = 10_000  # rows that a model from a file looks back
 _SLOWEST = 1e9  # time step of a model from a file [s]
 _MOST = 2048  # states, inputs or context of a model from a file
 _MOST_DECAYS = 64  # exponential means in a memory
+_MOST_PRODUCTS = 100_000  # of past features, about
 
 
 class NamedLogModel(NamedTuple):
@@ -311,10 +312,28 @@ def _memory(fields: Any) -> Memory:
         raise DataError(f"a memory has more than {_MOST_DECAYS} means")
     for decay in itertools.chain(*decays):
         check_number("decays", decay, least=0)
-    memory = Memory(fields["rows"], tuple(decays[0]), tuple(decays[1]))
+    memory = Memory(
+        rows=fields["rows"],
+        decays=tuple(decays[0]),
+        output_decays=tuple(decays[1]),
+        products=_products(fields.get("products")),
+    )
     if memory.reach > _LONGEST:
         raise DataError(f"a memory reaches back {memory.reach} rows")
     return memory
+
+
+def _products(fields: Any) -> Products | None:
+    """Makes products of their fields in a header; None where there are none."""
+    if fields is None:
+        return None
+    _check_rows("products", fields["rows"])
+    check_number("degree", fields["degree"], least=2, whole=True)
+    low, high = (tuple(map(float, fields[key])) for key in ("low", "high"))
+    variables = fields["rows"] * len(low)
+    if variables ** min(fields["degree"], 10) > _MOST_PRODUCTS:
+        raise DataError(f"products of {variables} features are too many")
+    return Products(fields["rows"], fields["degree"], low, high)
 
 
 def _numbers(tensors: Mapping[str, Tensor], key: str, empty: tuple[int, ...]) -> Array:

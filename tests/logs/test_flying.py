@@ -15,7 +15,7 @@ from gpmpc.models import LogDynamics, LogModel, MultirotorNominal, RigidBodyKine
 from gpmpc.models._kinematics import Increments
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import OutputGP
-from gpmpc.models._memory import Memory
+from gpmpc.models._memory import Memory, Products
 from gpmpc.models._parametric import AffineNominal
 from gpmpc.models._quaternions import rotation_quaternion
 from gpmpc.models._state_space import StateGroup, StateSpace
@@ -87,7 +87,8 @@ def test_what_no_controller_can_plan_with_is_named():
 def test_a_model_with_a_past_has_it_in_its_state():
     space = StateSpace((StateGroup("x", ("x", "y"), ""),))
     kinematics = Increments(space)
-    memory = Memory(rows=2, decays=(0.8,), output_decays=(0.5,))
+    products = Products(rows=2, degree=3, low=(-9.0,) * 3, high=(9.0,) * 3)
+    memory = Memory(2, (0.8,), (0.5,), products)
     rng = np.random.default_rng(2)
     regressors = memory.regressor_dim(3, 2)
     model = dynamics(

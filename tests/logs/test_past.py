@@ -17,9 +17,10 @@ from gpmpc.logs import (
 from gpmpc.logs._fit_form import fit_from
 from gpmpc.logs._linear_terms import fit_linear_term, refine_linear_term
 from gpmpc.logs._log import LogRun
+from gpmpc.logs._stability import grows_outside
 from gpmpc.models import LogModel
 from gpmpc.models._kinematics import Increments
-from gpmpc.models._memory import Memory
+from gpmpc.models._memory import Memory, Products
 from gpmpc.models._parametric import AffineNominal
 
 ROWS = Memory(rows=3, decays=(0.8,), output_decays=(0.5,))
@@ -87,8 +88,8 @@ def test_outputs_alone_are_learned_with_their_past(tmp_path):
 
 
 def test_gps_are_tried_upon_a_still_state_beside_the_best_structure():
-    runs = [replace(tanks(seed, 240).runs[0], name=f"{seed}") for seed in range(6)]
-    learned = learn(replace(tanks(0), runs=tuple(runs)), points=20, steps=40)
+    runs = [replace(tanks(seed, 200).runs[0], name=f"{seed}") for seed in range(4)]
+    learned = learn(replace(tanks(0), runs=tuple(runs)), points=10, steps=10)
     names = [candidate.name for candidate in learned.candidates]
     assert any(name.startswith("constant state, GP on y") for name in names)
 
@@ -164,7 +165,34 @@ class Pull:
         return np.asarray(gain)[..., None] * inputs - states
 
 
+def test_products_of_past_rows_learn_a_stiffening_spring():
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.normal(size=200), 4)
+    y = np.zeros(800)
+    for k in range(1, 799):
+        force = 0.3 * u[k] - 0.2 * y[k] - 0.4 * y[k] ** 3
+        y[k + 1] = y[k] + 0.8 * (y[k] - y[k - 1]) + force
+    log = as_log(y[:, None], u[:, None], 1.0)
+    train, held_out = log.split_by_time(0.7)
+    low, high = (tuple(f(np.c_[y, u], axis=0).tolist()) for f in (np.min, np.max))
+    memory = Memory(rows=1, products=Products(2, 3, low, high))
+    windows = held_out.windows(60, past=2)
+    rmse = []
+    for one in (Memory(rows=1), memory):
+        model = fit_linear_term(with_memory(train, one), train, steps=40)
+        rmse.append(np.sqrt(np.square(model.rollout_errors(windows)).mean()))
+    assert rmse[1] < 0.02 * rmse[0]
+    # Outside of the data products stand still, and the linear part decides.
+    assert not grows_outside(model, 1, 1.0)
+    pushed = replace(model, weights=model.weights + np.eye(1, model.weights.shape[1]))
+    assert grows_outside(pushed, 1, 1.0)
+
+
 def test_misuse_of_a_memory_is_named():
+    with pytest.raises(SettingError, match="products: must be of 2 rows at most"):
+        Memory(rows=1, products=Products(3, 2, (0.0,), (1.0,)))
+    with pytest.raises(SettingError, match="low: must be as many as high"):
+        Products(1, 2, (2.0,), (1.0,))
     with pytest.raises(SettingError, match=r"decays: must be within \[0, 1\)"):
         Memory(decays=(1.0,))
     with pytest.raises(SettingError, match="must be zero beside a memory"):
