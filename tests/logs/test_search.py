@@ -355,7 +355,7 @@ def tiny_search(log):
     """A search whose bases were considered, and nothing else."""
     search = Search(
         log=log,
-        folds=split_folds(log, PAST_ROWS, 5).pair,
+        folds=split_folds(log, PAST_ROWS, 5).parts,
         points=10,
         steps=5,
         seed=0,
