@@ -22,7 +22,7 @@ from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
 from gpmpc.logs._log import Log, LogRun
 
-_MANY_RUNS = 4  # from which on whole runs are dealt
+MANY_RUNS = 4  # from which on whole runs are dealt
 _SHORT = 3000  # rows of a log, below which it has more folds
 _FOLDS_OF_SHORT = 4
 _BLOCKS = (4, 8, 16)  # of a log of few runs
@@ -84,7 +84,7 @@ def split_folds(log: Log, past: int, steps: int) -> Folds:
 def _split(log: Log, count: int, past: int, steps: int) -> Folds | None:
     """Splits a log into folds; returns None where it is too short for so many."""
     splits: list[Folds] = []
-    if len(log.runs) >= max(_MANY_RUNS, count):
+    if len(log.runs) >= max(MANY_RUNS, count):
         splits = _deals_of_runs(log, count, past, steps)
     best_deal = _best(splits)
     if best_deal is not None and best_deal.coverage >= 1 - 5 * _NEARLY:

@@ -21,7 +21,7 @@ from gpmpc.gp._wrapped import warn_of_turns
 from gpmpc.logs._comparison import Comparison
 from gpmpc.logs._control_fitness import ControlFitness, judge_for_control
 from gpmpc.logs._fitting import STEPS, NominalFit
-from gpmpc.logs._folds import split_folds
+from gpmpc.logs._folds import MANY_RUNS, split_folds
 from gpmpc.logs._log import Log
 from gpmpc.logs._search import PAST_ROWS, Search
 from gpmpc.logs._structures import Candidate
@@ -76,7 +76,7 @@ def learn(
         log: Of one run at least. Four runs or more are dealt to folds, the blocks of
             fewer take turns.
         points: Rows that a GP is trained on, chosen by k-means.
-        steps: Of the rollouts.
+        steps: Of the rollouts; fewer where the log is too short to be halved for them.
         seed: Of every random number.
         progress: Called with a line at each stage.
         memory: Holds results of the stages, as plain data: those of an earlier call
@@ -103,6 +103,10 @@ def learn(
         raise SettingError("for_control", rule)
     advice = "Say kind: angle of it in the mapping"
     warn_of_turns(log.transitions(), log.space.angles, advice)
+    affordable = _most_steps(log)
+    if affordable < steps:
+        progress(f"short log: rollouts of {affordable} steps decide, not of {steps}")
+        steps = affordable
     folds = split_folds(log, PAST_ROWS, steps)
     progress(folds.sentence)
     search = Search(
@@ -117,6 +121,14 @@ def learn(
     )
     search.run()
     return _identify(search, log, folds.sentence, progress, for_control)
+
+
+def _most_steps(log: Log) -> int:
+    """Returns the most steps, two at least, of which any fold of a log has windows."""
+    longest = max(end - begin for run in log for begin, end in run.pieces)
+    if len(log.runs) < MANY_RUNS:
+        longest //= 2  # runs are halved where nothing else is possible
+    return max(longest - PAST_ROWS - 2, 2)
 
 
 def _identify(
