@@ -60,19 +60,21 @@ class Folds:
         )
 
 
-def split_folds(log: Log, past: int, steps: int) -> Folds:
+def split_folds(log: Log, past: int, steps: int, most: int = _FOLDS_OF_SHORT) -> Folds:
     """Splits a log into two folds; into four where it is short.
 
     Args:
         log: All runs.
         past: Rows that a window has before its start.
         steps: Rows that it has after it.
+        most: Folds, two or four: of structures with few parameters half of the rows
+            tell enough.
 
     Raises:
         DataError: No piece of the log is long enough for windows in both folds.
     """
-    if len(log) < _SHORT:
-        folds = _split(log, _FOLDS_OF_SHORT, past, steps)
+    if len(log) < _SHORT and most > 2:
+        folds = _split(log, most, past, steps)
         if folds is not None:
             return folds
     folds = _split(log, 2, past, steps)

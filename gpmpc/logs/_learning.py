@@ -107,7 +107,8 @@ def learn(
     if affordable < steps:
         progress(f"short log: rollouts of {affordable} steps decide, not of {steps}")
         steps = affordable
-    folds = split_folds(log, PAST_ROWS, steps)
+    has_few_parameters = for_control or log.mapping.model != "none"
+    folds = split_folds(log, PAST_ROWS, steps, most=2 if has_few_parameters else 4)
     progress(folds.sentence)
     search = Search(
         log=log,
