@@ -26,10 +26,12 @@ How ``learn`` makes a model of a log:
 3. rows          ``_smoothing`` takes the noise from the rows that models are fitted to.
 4. parameters    ``_fitting`` fits nominal models on rollouts.
 5. residuals     ``_output_gps`` trains GPs on what a nominal model leaves.
-6. choice        ``_search`` compares structures on held-out rows, beside the baselines
-                 of ``_baselines``; ``_rollout_corrections`` corrects rollouts by the
-                 past; ``_comparison`` says by how much one wins.
-7. noise         ``_noise`` finds the noise behind the errors of held-out rollouts.
+6. choice        ``_search`` compares structures: ``_structure_fits`` fits them on each
+                 fold, ``_held_out_errors`` holds their errors beside those of the
+                 baselines of ``_baselines``; ``_comparison`` says by how much one wins.
+7. corrections   ``_rollout_corrections`` corrects rollouts by the past, fitted to those
+                 of ``_validation``.
+8. noise         ``_noise`` finds the noise behind the errors of held-out rollouts.
 
 ``_learning`` holds these steps in their order. ``_judging`` judges what was learned
 beside baselines, ``_control_fitness`` whether a controller can plan with it;

@@ -22,8 +22,9 @@ from gpmpc.logs._comparison import Comparison
 from gpmpc.logs._control_fitness import ControlFitness, judge_for_control
 from gpmpc.logs._fitting import STEPS, NominalFit
 from gpmpc.logs._folds import MANY_RUNS, split_folds
+from gpmpc.logs._held_out_errors import PAST_ROWS
 from gpmpc.logs._log import Log
-from gpmpc.logs._search import PAST_ROWS, Search
+from gpmpc.logs._search import Search
 from gpmpc.logs._structures import Candidate
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel

@@ -13,9 +13,10 @@ from gpmpc.logs import Log, LogMapping, judge, learn
 from gpmpc.logs._comparison import compare
 from gpmpc.logs._control_fitness import judge_for_control
 from gpmpc.logs._folds import split_folds
+from gpmpc.logs._held_out_errors import PAST_ROWS
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._rollout_corrections import Rollouts, choose_averages
-from gpmpc.logs._search import PAST_ROWS, Search
+from gpmpc.logs._search import Search
 from gpmpc.logs._smoothing import smooth
 from gpmpc.logs._structures import additions, bases
 from gpmpc.models import LogModel
@@ -375,8 +376,9 @@ def test_a_runner_up_does_not_stand_for_the_baseline_of_its_name(monkeypatch):
     (rival,) = [name for name in names if "fitted on rollouts" in name]
     assert rival.partition(",")[0] in names
     # A short run has a window, however many rows the others have.
-    monkeypatch.setattr("gpmpc.logs._search._CORRECTED_WINDOWS", 1)
-    assert all(len(one.rollouts.windows) for one in search._validate(search.best))
+    monkeypatch.setattr("gpmpc.logs._validation._CORRECTED_WINDOWS", 1)
+    validations = search._validations._validate(search.best)
+    assert all(len(one.rollouts.windows) for one in validations)
 
 
 def test_without_inputs_nothing_acts_through_lags():

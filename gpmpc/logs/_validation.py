@@ -1,0 +1,185 @@
+"""Rollouts of held-out rows to which corrections and the noise are fitted."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from gpmpc.exceptions import DataError
+from gpmpc.logs._fitting import NominalFit
+from gpmpc.logs._folds import Fold
+from gpmpc.logs._held_out_errors import PAST_ROWS
+from gpmpc.logs._log import Log
+from gpmpc.logs._noise import fit_noise
+from gpmpc.logs._rollout_corrections import (
+    Averages,
+    Rollouts,
+    choose_averages,
+    fit_correction,
+)
+from gpmpc.logs._structure_fits import StructureFits
+from gpmpc.logs._structures import Structure
+from gpmpc.models._log_dynamics import OutputNoise
+from gpmpc.models._log_model import LogModel
+
+_CORRECTED_WINDOWS = 2400  # that a correction is fitted to
+_LARGEST = 1e6  # state of a rollout that a correction is fitted to
+
+
+class _Validation(NamedTuple):
+    """Held-out rows, and a model without a correction that was fitted to the others."""
+
+    held_out: Log
+    model: LogModel
+    rollouts: Rollouts  # of the held-out rows
+
+
+class Validations:
+    """Structures fitted to parts of the rows, and rolled out on the others.
+
+    Models of half the rows err more than the one of all. Here three quarters are fitted
+    to, where there are rows enough for windows.
+
+    Args:
+        log: All runs.
+        folds: Of the log.
+        fits: Of structures.
+        steps: Of the rollouts.
+        judged_steps: Those at which corrections are fitted.
+    """
+
+    def __init__(
+        self,
+        log: Log,
+        folds: Sequence[Fold],
+        fits: StructureFits,
+        steps: int,
+        judged_steps: tuple[int, ...],
+    ):
+        self._log = log
+        self._folds = folds
+        self._fits = fits
+        self._steps = steps
+        self._judged_steps = judged_steps
+        self._validations: dict[str, list[_Validation]] = {}
+
+    def choose_averages(self, structure: Structure) -> Averages | None:
+        """Chooses the best average of corrections of a structure.
+
+        There is none where rollouts diverge on all that a model was not fitted to.
+        """
+        parts = [one.rollouts for one in self._validate(structure)]
+        if not all(len(rollouts.windows) for rollouts in parts):
+            return None
+        return choose_averages(
+            kinematics=structure.model.kinematics,
+            rollouts=Rollouts.concatenate(parts),
+            judged_steps=self._judged_steps,
+        )
+
+    def models(self, structure: Structure) -> list[LogModel]:
+        """Returns the models of a structure, one of each fold, with corrections."""
+        models = self._fits.models(structure)
+        if not structure.shares:
+            return models
+        rollouts = [
+            self._rollouts(model, fold.held_out)
+            for model, fold in zip(models, self._folds, strict=True)
+        ]
+        # What one fold holds out, the models of the others were fitted to.
+        return [
+            self._correct(model, structure, rollouts[:i] + rollouts[i + 1 :])
+            for i, model in enumerate(models)
+        ]
+
+    def fit_noise(self, structure: Structure) -> OutputNoise:
+        """Fits the noise of a structure to the errors of its rollouts."""
+        validations = self._validate(structure)
+        models = []
+        for validation in validations:
+            others = [one.rollouts for one in validations if one is not validation]
+            models.append(self._correct(validation.model, structure, others))
+        held_out = [validation.held_out for validation in validations]
+        return fit_noise(models, held_out, self._steps)
+
+    def fit_to_all_runs(self, structure: Structure) -> NominalFit:
+        """Fits a structure to all runs, its GPs and its correction as well."""
+        fit = self._fits.fit_to_all_runs(structure)
+        rollouts = [validation.rollouts for validation in self._validate(structure)]
+        return replace(fit, model=self._correct(fit.model, structure, rollouts))
+
+    def _validate(self, structure: Structure) -> list[_Validation]:
+        """Fits a structure to parts of the rows, and rolls it out on the others.
+
+        Models of half the rows err more than the one of all. Here three quarters are
+        fitted to, where there are rows enough for windows.
+        """
+        structure = replace(structure, shares=())
+        if structure.key not in self._validations:
+            folds, models = self._validation_models(structure)
+            self._validations[structure.key] = [
+                _Validation(fold.held_out, model, self._rollouts(model, fold.held_out))
+                for fold, model in zip(folds, models, strict=True)
+            ]
+        return self._validations[structure.key]
+
+    def _validation_models(
+        self, structure: Structure
+    ) -> tuple[Sequence[Fold], list[LogModel]]:
+        """Returns folds with three quarters to fit to, if there are rows enough."""
+        if len(self._folds) == 2:
+            try:
+                folds = self._quarters()
+                return folds, [
+                    self._fits.fit_to(fold.train, structure).model for fold in folds
+                ]
+            except DataError:
+                pass
+        return self._folds, self._fits.models(structure)
+
+    def _quarters(self) -> list[Fold]:
+        """Halves what each fold holds out, every other run or block of it.
+
+        Raises:
+            DataError: One would be without windows.
+        """
+        quarters = []
+        for fold in self._folds:
+            runs = fold.held_out.runs
+            for first in range(2):
+                others = (*fold.train.runs, *runs[1 - first :: 2])
+                quarter = Fold(
+                    train=replace(fold.train, runs=others),
+                    held_out=replace(fold.held_out, runs=runs[first::2]),
+                )
+                quarter.held_out.windows(self._steps, past=PAST_ROWS, most=1)
+                quarters.append(quarter)
+        return quarters
+
+    def _rollouts(self, model: LogModel, held_out: Log) -> Rollouts:
+        """Rolls a model out on held-out rows, and leaves out what diverges."""
+        share = len(held_out) / len(self._log)
+        windows = held_out.windows(
+            ahead=self._steps,
+            past=PAST_ROWS,
+            most=max(round(share * _CORRECTED_WINDOWS), 1),
+        )
+        with np.errstate(over="ignore", invalid="ignore"):
+            predicted = model.rollout(windows)
+        is_finite = np.abs(predicted).max(axis=(1, 2)) < _LARGEST
+        return Rollouts(windows, predicted)[is_finite]
+
+    def _correct(
+        self, model: LogModel, structure: Structure, rollouts: Sequence[Rollouts]
+    ) -> LogModel:
+        """Adds the correction of a structure, fitted to rollouts, if it has one."""
+        if not structure.shares:
+            return model
+        correction = fit_correction(
+            kinematics=model.kinematics,
+            rollouts=Rollouts.concatenate(rollouts),
+            judged_steps=self._judged_steps,
+            shares=np.array(structure.shares),
+        )
+        return replace(model, correction=correction)
