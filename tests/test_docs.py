@@ -21,9 +21,9 @@ from tests.pages import BLOCK, ROOT, read
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
 
 
-def test_a_newcomers_eleven_tasks_work_from_an_empty_folder(page, tmp_path):
+def test_a_newcomers_tasks_work_from_an_empty_folder(page, tmp_path):
     names, printed = page("docs/how_to.md")
-    assert read("docs/how_to.md").count("\n## ") == 11
+    assert read("docs/how_to.md").count("\n## ") == 15
     assert "(docs/how_to.md)" in read("README.md")
     (
         weights,
@@ -58,6 +58,9 @@ def test_a_newcomers_eleven_tasks_work_from_an_empty_folder(page, tmp_path):
     assert (
         np.abs(read_run(recording).states[10:, :3:2]).max() < 3.5
     )  # of width 3, not 4
+    assert (tmp_path / "c_code/src/gpmpc.c").exists()
+    assert len(read_run(tmp_path / "moving.mcap").times) >= 20
+    assert names["flight"].states[-1, 0] > 1.0  # of the 1.67 m that were asked
     (recording,) = tmp_path.glob("arm/outputs/run/*/run.mcap")
     assert abs(read_run(recording).states[-1, 0] - 1) < 0.1
     assert float(names["errors"].abs().max()) < 0.2
