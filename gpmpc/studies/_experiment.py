@@ -92,7 +92,8 @@ class Experiment:
 
     def __post_init__(self) -> None:
         check_kind("system", self.system, System, "a System")
-        check_method("data", self.data, "transitions", "RandomData(...)")
+        if self.data is not None:
+            check_method("data", self.data, "transitions", "RandomData(...)")
         self._check_functions()
         self._check_numbers()
         self._check_loop()
