@@ -33,7 +33,7 @@ _RIDGE = _PRIORS.index(Prior(PENALTY, 0.0))  # the ridge regression without a mo
 _NOTHING = 1e-300  # an error that is added, so that ratios of exact rollouts are one
 _MEMBERS = 8  # of an average, at most; one may be in it several times
 _RIDGE_SHARES = (0.5, 0.375, 0.25, 0.125)  # of an average, the first that costs little
-_COST = 0.02  # of the error, that such a share may add
+_COST = 0.04  # of the mean error, that such a share may add
 
 
 @dataclass(frozen=True)
@@ -105,10 +105,10 @@ def choose_averages(
         for g, columns in enumerate(columns_by_group):
             own = errors[:, :, k, columns]
             shares[:, k, g] = _choose_shares(own, runs)
-            averaged = np.linalg.norm(_average(shares[:, k, g], own), axis=-1)
+            averaged = _mean_length(_average(shares[:, k, g], own))
             # The first prior leaves the rollouts as they are.
-            without = np.linalg.norm(own[0], axis=-1)
-            ratios[k, g] = (averaged.mean() + _NOTHING) / (without.mean() + _NOTHING)
+            without = _mean_length(own[0])
+            ratios[k, g] = (averaged + _NOTHING) / (without + _NOTHING)
     return Averages(shares, ratios)
 
 
@@ -155,7 +155,7 @@ def _choose_shares(errors: Array, runs: np.ndarray) -> Array:
         counts[best] += 1
         total = total + errors[best]
     shares = _without_chance(counts / counts.sum(), errors, runs, weights)
-    return _with_ridge(shares, errors, weights)
+    return _with_ridge(shares, errors)
 
 
 def _without_chance(
@@ -187,19 +187,18 @@ def _without_chance(
     return moved
 
 
-def _with_ridge(shares: Array, errors: Array, weights: Array) -> Array:
+def _with_ridge(shares: Array, errors: Array) -> Array:
     """Gives the ridge regression the largest share (A,) that costs next to nothing.
 
     Args:
         shares: Of the corrections (A,).
         errors: Of each (A, W, e).
-        weights: Of the windows (W,).
     """
-    most = (1 + _COST) * np.linalg.norm(_average(shares, errors), axis=-1) @ weights
+    most = (1 + _COST) * _mean_length(_average(shares, errors))
     for share in _RIDGE_SHARES:
         mixed = (1 - share) * shares
         mixed[_RIDGE] += share
-        if np.linalg.norm(_average(mixed, errors), axis=-1) @ weights <= most:
+        if _mean_length(_average(mixed, errors)) <= most:
             return mixed
     return shares
 
@@ -207,6 +206,11 @@ def _with_ridge(shares: Array, errors: Array, weights: Array) -> Array:
 def _average(shares: Array, errors: Array) -> Array:
     """Averages errors (A, W, e) with shares (A,)."""
     return np.einsum("a,awe->we", shares, errors)
+
+
+def _mean_length(errors: Array) -> float:
+    """Computes the mean length of errors (W, e)."""
+    return float(np.linalg.norm(errors, axis=-1).mean())
 
 
 def _weights_by_run(reference: Array, runs: np.ndarray) -> Array:
