@@ -11,7 +11,7 @@ import numpy as np
 from gpmpc._angles import TURN
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, to_array
-from gpmpc.exceptions import ShapeError, check_method
+from gpmpc.exceptions import ShapeError
 from gpmpc.gp import GPPosterior
 from gpmpc.models import LogDynamics, ResidualModel, RigidBodyKinematics
 from gpmpc.models._past import measured_dim
@@ -80,7 +80,6 @@ def beyond_data(model: DynamicsModel, reference: Any) -> list[BeyondData]:
         ``BeyondData``; ``gpmpc.datasets.RandomData`` for data that reach
         farther.
     """
-    check_method("model", model, "predict", "a learned model")
     signals = signals_of(model)
     states = np.atleast_2d(read_reference(reference).in_order(signals).states)
     states = np.asarray(states, dtype=float)
