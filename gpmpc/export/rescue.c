@@ -271,11 +271,12 @@ static int correct_multipliers(Rescue *rescue, gpmpc_program *work)
 static real terms_of(const gpmpc_program *work, int p)
 {
     real terms = 0;
+    int row = p - N;
     int j;
-    if (p < N)
+    if (row < 0)
         return absolute(work->value[p]);
-    for (j = 0; j < work->row_end[p]; j++)
-        terms += absolute(work->G[p - N][j] * work->value[j]);
+    for (j = 0; j < N; j++)
+        terms += absolute(work->G[row][j] * work->value[j]);
     return terms;
 }
 
