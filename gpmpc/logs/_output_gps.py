@@ -15,6 +15,8 @@ from gpmpc.logs._log import Log
 from gpmpc.models._log_model import LogModel, OutputGP
 from gpmpc.models._windows import Windows
 
+_TOLERANCE = 1e-4  # of the training; rollouts tell no smaller one apart
+
 
 def train_output_gp(
     model: LogModel,
@@ -49,7 +51,9 @@ def train_output_gp(
         features=names,
         outputs=[model.kinematics.output_names[output] for output in outputs],
     )
-    trainer = Trainer(predicts="value", scaling=standardize, restarts=1, tolerance=1e-6)
+    trainer = Trainer(
+        predicts="value", scaling=standardize, restarts=1, tolerance=_TOLERANCE
+    )
     training = trainer.fit(
         torch.from_numpy(features[chosen]),
         torch.from_numpy(targets),
