@@ -169,21 +169,27 @@ def check_method(key: str, value: object, method: str, example: str) -> None:
         raise SettingError(key, f"{rule}; got {got}")
 
 
-def check_indices(key: str, indices: Any, count: int) -> tuple[int, ...]:
-    """Returns a setting that is different indices, from 0 to count - 1.
+def check_indices(
+    key: str, indices: Any, count: int, *, may_repeat: bool = False
+) -> tuple[int, ...]:
+    """Returns a setting that is indices from 0 to count - 1, all different.
+
+    Where they ``may_repeat`` some may be equal.
 
     Raises:
         SettingError: It is no list of them; a mask of truth values is none.
     """
     is_list = isinstance(indices, Iterable) and not isinstance(indices, str)
-    given: tuple[Any, ...] = tuple(indices) if is_list else ()
-    whole = all(isinstance(i, Integral) and not isinstance(i, bool) for i in given)
-    in_range = whole and all(0 <= i < count for i in given)
-    if not (is_list and in_range and len(set(given)) == len(given)):
-        got = list(given) if is_list else indices
-        rule = f"must be a list of different indices from 0 to {count - 1}"
+    entries: tuple[Any, ...] = tuple(indices) if is_list else ()
+    whole = all(isinstance(i, Integral) and not isinstance(i, bool) for i in entries)
+    in_range = whole and all(0 <= i < count for i in entries)
+    repeats = in_range and len(set(entries)) < len(entries)
+    if not (is_list and in_range) or (repeats and not may_repeat):
+        got = list(entries) if is_list else indices
+        kind = "indices" if may_repeat else "different indices"
+        rule = f"must be a list of {kind} from 0 to {count - 1}"
         raise SettingError(key, f"{rule}; got {got!r}")
-    return tuple(int(i) for i in given)
+    return tuple(int(i) for i in entries)
 
 
 def check_flag(key: str, value: Any) -> None:

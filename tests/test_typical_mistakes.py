@@ -376,7 +376,7 @@ MODELS = {
     ),
     "measured by name": (
         lambda: Measurement.of_states(2, ["position"], [0.1]),
-        "states: must be a list of different indices",
+        "states: must be a list of indices",
     ),
     "negative deviation": (
         lambda: Measurement.of_states(2, [0], [-0.1]),
@@ -738,11 +738,11 @@ OF_A_KIND = {
     ),
     "one state without a list": (
         lambda: Measurement.of_states(2, 0, [0.1]),
-        "states: must be a list of different indices from 0 to 1; got 0",
+        "states: must be a list of indices from 0 to 1; got 0",
     ),
-    "a state measured twice": (
-        lambda: Measurement.of_states(2, [0, 0], [0.1, 0.1]),
-        "states: must be a list of different indices from 0 to 1; got [0, 0]",
+    "an angle named twice": (
+        lambda: Tracking([1.0, 1.0], [1.0], angles=[0, 0]),
+        "angles: must be a list of different indices from 0 to 1; got [0, 0]",
     ),
     "the class of a model": (
         lambda: controller(model=Trainer),

@@ -115,7 +115,8 @@ class Measurement(TensorModel):
 
         Args:
             state_dim: n.
-            states: Indices of the measured states.
+            states: Indices of the measured states; one that several sensors measure
+                comes several times.
             std: Standard deviations of their noise.
             angles: Those of the measured states that sensors show modulo one turn, by
                 their place among them.
@@ -123,7 +124,7 @@ class Measurement(TensorModel):
         Raises:
             SettingError: A state is out of range, or a standard deviation is negative.
         """
-        states = check_indices("states", states, state_dim)
+        states = check_indices("states", states, state_dim, may_repeat=True)
         if not states:
             raise SettingError("states", "must name a state; got none")
         check_numbers("std", std, len(states), least=0)

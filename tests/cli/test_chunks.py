@@ -6,7 +6,7 @@ import os
 import hydra
 import pytest
 
-from gpmpc.cli import _chunks, _run
+from gpmpc.cli import _run
 from gpmpc.cli._chunks import Chunk, Chunking, Job, fly_chunk
 from gpmpc.cli._composing import Composer
 from gpmpc.cli._examples import Examples
@@ -104,7 +104,7 @@ def test_a_chunk_goes_on_behind_what_cannot_be_flown(tmp_path, monkeypatch):
         if seed in (2, 3):
             raise SettingError("folder", "cannot write")
 
-    monkeypatch.setattr(_chunks, "run_one", run)
+    monkeypatch.setattr(_run, "run_one", run)
     with pytest.raises(GpmpcError) as told:
         fly_chunk(Chunk(tuple(jobs), None))
     assert flown == [0, 1, 2, 3, 4]

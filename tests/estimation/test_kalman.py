@@ -473,7 +473,7 @@ def test_errors_of_the_wrong_size_are_inconsistent():
         (
             lambda m: Measurement.of_states(2, [2], [0.1]),
             SettingError,
-            "states: must be a list of different indices",
+            "states: must be a list of indices",
         ),
         (
             lambda m: Measurement.of_states(2, [1], [-0.1]),
