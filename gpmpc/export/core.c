@@ -1164,12 +1164,19 @@ static real elastic_price(const gpmpc_problem *problem, const real *misses,
             const real *Q = running_weight(k);
             real miss = misses[k * r + e];
             real weight = 0;
+            real largest = 0;
             real square;
             if (!row_is_elastic[e] || !(miss > 0))
                 continue;
-            for (i = 0; i < n; i++)
+            for (i = 0; i < n; i++) {
                 weight += g[i] * dot(Q + i * n, g, n);
-            square = larger(dot(g, g, n), REAL(1e-12));
+                largest = larger(largest, Q[i * n + i]);
+            }
+            square = dot(g, g, n);
+            largest *= square; /* counts where the cost does not weigh the direction */
+            if (!(weight > REAL(1e-12) * largest))
+                weight = largest;
+            square = larger(square, REAL(1e-12));
             sum_of_misses += miss;
             beside += weight / (square * square) * miss * miss;
         }

@@ -63,7 +63,8 @@ def elastic_price(
     of_stages = _by_stage(Q.reshape(-1, n, n), len(missed))
     weights = np.einsum("kri,kij,krj->kr", gradients, of_stages, gradients)
     squares = (gradients**2).sum(axis=2)
-    largest = np.linalg.eigvalsh(of_stages).max(axis=1, keepdims=True) * squares
+    diagonals = np.diagonal(of_stages, axis1=1, axis2=2)
+    largest = diagonals.max(axis=1, keepdims=True) * squares
     weights = np.where(weights > _TINY * largest, weights, largest)
     # The cheapest move by a violation v along a gradient g has the size v / |g|.
     moving_costs = weights / np.maximum(squares, _TINY) ** 2 * missed**2
