@@ -60,9 +60,15 @@ def tightens(controller: GPMPC) -> bool:
     )
 
 
-def rolls_out(controller: GPMPC) -> bool:
-    """Returns whether every plan is rolled out before it is judged."""
-    return controller.prediction.rolls_out
+def needs_means_alone(controller: GPMPC) -> bool:
+    """Returns whether the model is asked for a mean without its derivatives.
+
+    It is where plans are rolled out, and where a disturbance is estimated.
+    """
+    prediction = controller.prediction
+    if prediction.rolls_out or prediction.constraints.gives_way:
+        return True
+    return prediction.settings.disturbance_gain > 0
 
 
 def _kappas(controller: GPMPC) -> Array:
@@ -125,7 +131,7 @@ def _flags(controller: GPMPC, numbers: Numbers, on_failure: str) -> dict[str, bo
         "GPMPC_OUTPUTS": bool(controller.problem.outputs),
         "GPMPC_TUBES": tightens(controller),
         "GPMPC_FEEDBACK": settings.feedback,
-        "GPMPC_ROLLS_OUT": rolls_out(controller),
+        "GPMPC_ROLLS_OUT": controller.prediction.rolls_out,
         "GPMPC_HELD": settings.is_held,
         "GPMPC_ESTIMATES": settings.disturbance_gain > 0,
         "GPMPC_HOLDS": on_failure == "hold",

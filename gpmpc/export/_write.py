@@ -11,7 +11,7 @@ from gpmpc.export._checks import check_exportable
 from gpmpc.export._filter import Estimator, FilterWriter, check_estimator
 from gpmpc.export._functions import FunctionWriter
 from gpmpc.export._models import ModelWriter
-from gpmpc.export._problems import definitions, rolls_out, tables, tightens
+from gpmpc.export._problems import definitions, needs_means_alone, tables, tightens
 from gpmpc.export._text import Numbers, Precision, comment
 from gpmpc.mpc import GPMPC
 
@@ -101,7 +101,7 @@ def _texts(
     """Returns header and source."""
     functions = FunctionWriter(controller, numbers)
     prediction = controller.prediction
-    means_alone = rolls_out(controller) or prediction.settings.disturbance_gain > 0
+    means_alone = needs_means_alone(controller)
     variances = tightens(controller) or estimator is not None
     model = ModelWriter(numbers, variances, means_alone)
     model.write(prediction.model, "model")

@@ -417,7 +417,7 @@ static void riccati(const real *A, const real *B, const real *Q, const real *R,
         }
 }
 
-#if GPMPC_TUBES || GPMPC_ROLLS_OUT
+#if GPMPC_TUBES || GPMPC_ROLLS_OUT || GPMPC_ELASTIC
 /* Gains K_k of u = u_k - K_k (x - x_k), the regulator of the plan's own stages. */
 static void write_gains(gpmpc_problem *problem)
 {
@@ -1073,6 +1073,37 @@ static void condense(gpmpc_controller *controller)
    --------------------------------------------------------------------------------- */
 
 /* What a plan costs: its stages, summed. */
+#if GPMPC_ROLLS_OUT || GPMPC_ELASTIC
+/* Replaces a plan (x', u') by the one that the dynamics obey on the way along it,
+   u = u' + F (x - x') within its bounds. */
+static void follow(gpmpc_controller *controller, real *states, real *inputs)
+{
+    gpmpc_problem *problem = &controller->problem;
+    real target[GPMPC_STATES];
+    int k, i, j;
+    copy(states, target, n);
+    for (k = 0; k < H; k++) {
+        const real *state = states + k * n;
+        real *next = states + (k + 1) * n;
+        for (i = 0; i < m; i++) {
+            real last =
+                k > 0 ? inputs[(k - 1) * m + i] : problem->previous_input[i];
+            real u = inputs[k * m + i];
+            for (j = 0; j < n; j++) {
+                real gain = problem->has_feedback ? problem->feedback[k][i][j]
+                                                  : -problem->gains[k][i][j];
+                u += gain * (state[j] - target[j]);
+            }
+            inputs[k * m + i] = within_box(within_rates(u, last, k, i), k, i);
+        }
+        copy(next, target, n);
+        model(state, inputs + k * m, &problem->work, next, 0, 0);
+        for (i = 0; i < n && GPMPC_ESTIMATES; i++)
+            next[i] += controller->disturbance[i];
+    }
+}
+#endif
+
 #if GPMPC_ELASTIC
 static real cost_of_plan(const gpmpc_problem *problem, const real *states,
                          const real *inputs)
@@ -1148,12 +1179,19 @@ static int keeps_elastic_rows(const real *misses)
     return 1;
 }
 
-/* Returns the price of elastic rows that cannot be kept (gpmpc/mpc/_elastic.py):
-   with cost J0 and violations V0 of the plan without them,
-   price = 2 (J + ..) / V0,   J0 <= J <= 2 J0 */
-static real elastic_price(const gpmpc_problem *problem, const real *misses,
-                          real free_cost, real last_cost)
+/* What elastic rows that cannot be kept may cost. */
+typedef struct {
+    real least_price; /* under which no plan outweighs the cost */
+    real extra_cost;  /* of a plan under a higher price, beside that without them */
+} elastic_limits;
+
+/* Returns the limits of the price of elastic rows (gpmpc/mpc/_elastic.py): with cost J0
+   and violations V0 of the plan without them,
+   least price = 2 (J + ..) / V0,   extra cost = (J + ..) / 20,   J0 <= J <= 2 J0 */
+static elastic_limits limits_of_price(const gpmpc_problem *problem, const real *misses,
+                                      real free_cost, real last_cost)
 {
+    elastic_limits limits;
     real cost = smaller(larger(free_cost, last_cost), 2 * free_cost);
     real sum_of_misses = 0;
     real beside = 0;
@@ -1180,7 +1218,10 @@ static real elastic_price(const gpmpc_problem *problem, const real *misses,
             sum_of_misses += miss;
             beside += weight / (square * square) * miss * miss;
         }
-    return 2 * (cost + beside) / larger(sum_of_misses, REAL(1e-12));
+    cost += beside;
+    limits.least_price = 2 * cost / larger(sum_of_misses, REAL(1e-12));
+    limits.extra_cost = REAL(0.05) * cost;
+    return limits;
 }
 
 /* Sets the price of the elastic rows. */
@@ -1192,30 +1233,90 @@ static void set_elastic_price(gpmpc_problem *problem, real price)
             problem->prices[e] = price;
 }
 
-/* Solves the program once more where its solution misses an elastic row, with a price
-   that cannot outweigh the cost. */
-static void lower_elastic_prices(gpmpc_controller *controller)
+/* What it costs to roll the model out along the plan of a solution: infinite where that
+   overflows. */
+static real cost_when_followed(gpmpc_controller *controller,
+                               const gpmpc_solution *solution)
+{
+    gpmpc_problem *problem = &controller->problem;
+    real inputs[GPMPC_SIZE];
+    real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
+    expand(problem, solution->x, inputs, states);
+    follow(controller, states, inputs);
+    if (!all_finite(states, (H + 1) * n))
+        return INFINITY;
+    return cost_of_plan(problem, states, inputs);
+}
+
+/* Solves the program for the highest price of elastic rows whose plan is affordable: of
+   a few between the least price and the highest one, and the least where none is. */
+static void raise_elastic_price(gpmpc_controller *controller, real price, real highest,
+                                real affordable_cost)
 {
     gpmpc_problem *problem = &controller->problem;
     gpmpc_program *program = &controller->program;
     gpmpc_solution *solution = &controller->candidate;
+    gpmpc_solution *trial = &controller->elastic;
+    int is_affordable = 0;
+    int i;
+    for (i = 0; i < 5; i++) {
+        real middle = SQRT(price * highest);
+        set_elastic_price(problem, middle);
+        solve(problem, program, solution, trial);
+        if (trial->status == GPMPC_SOLVED
+            && cost_when_followed(controller, trial) <= affordable_cost) {
+            is_affordable = 1;
+            price = middle;
+            *solution = *trial;
+        } else {
+            highest = middle;
+        }
+    }
+    set_elastic_price(problem, price);
+    if (!is_affordable)
+        solve(problem, program, solution, solution);
+}
+
+/* Replaces a solution that misses an elastic row by the one under the price that the
+   row is worth. */
+static void solve_elastic(gpmpc_controller *controller)
+{
+    gpmpc_problem *problem = &controller->problem;
+    gpmpc_solution *solution = &controller->candidate;
+    gpmpc_solution *without = &controller->elastic;
+    elastic_limits limits;
     real misses[GPMPC_STATE_ROWS];
     real inputs[GPMPC_SIZE];
     real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
-    real last_cost, free_cost;
+    real last_cost, free_cost, affordable_cost;
+    real highest = 0;
+    int e;
     if (solution->status != GPMPC_SOLVED)
         return;
     write_misses(problem, solution, misses);
     if (keeps_elastic_rows(misses))
         return;
+    for (e = 0; e < r; e++)
+        if (row_is_elastic[e])
+            highest = larger(highest, problem->prices[e]);
     last_cost = cost_of_plan(problem, &problem->states[0][0], &problem->inputs[0][0]);
     set_elastic_price(problem, REAL(1e-9)); /* next to nothing: rows keep their place */
-    solve(problem, program, solution, &controller->elastic);
-    expand(problem, controller->elastic.x, inputs, states);
-    free_cost = cost_of_plan(problem, states, inputs);
-    write_misses(problem, &controller->elastic, misses);
-    set_elastic_price(problem, elastic_price(problem, misses, free_cost, last_cost));
-    solve(problem, program, solution, solution);
+    solve(problem, &controller->program, solution, without);
+    expand(problem, without->x, inputs, states);
+    write_misses(problem, without, misses);
+    limits = limits_of_price(problem, misses, cost_of_plan(problem, states, inputs),
+                             last_cost);
+    if (!problem->has_feedback)
+        write_gains(problem);
+    free_cost = cost_when_followed(controller, without);
+    affordable_cost = free_cost + limits.extra_cost;
+    if (!is_finite(affordable_cost))
+        affordable_cost = -INFINITY;
+    set_elastic_price(problem, highest);
+    if (cost_when_followed(controller, solution) <= affordable_cost)
+        return;
+    raise_elastic_price(controller, smaller(limits.least_price, highest), highest,
+                        affordable_cost);
 }
 #endif
 
@@ -1272,36 +1373,22 @@ static int is_usable(const gpmpc_controller *controller)
 }
 
 #if GPMPC_ROLLS_OUT
-/* Rolls the dynamics out towards the plan, u = u' + F (x - x') within its bounds, so
-   that it obeys them; the plan stays where that leads out of the numbers. */
+/* Rolls the dynamics out towards the plan, so that it obeys them; the plan stays where
+   that leads out of the numbers. */
 static void close_defects(gpmpc_controller *controller)
 {
     gpmpc_problem *problem = &controller->problem;
-    real states[GPMPC_HORIZON + 1][GPMPC_STATES];
-    real inputs[GPMPC_HORIZON][GPMPC_INPUTS];
-    int k, i, j;
+    real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
+    real inputs[GPMPC_SIZE];
     if (!problem->has_feedback)
         write_gains(problem);
-    copy(problem->states[0], states[0], n);
-    for (k = 0; k < H; k++) {
-        for (i = 0; i < m; i++) {
-            real last = k > 0 ? inputs[k - 1][i] : problem->previous_input[i];
-            real u = problem->inputs[k][i];
-            for (j = 0; j < n; j++) {
-                real gain = problem->has_feedback ? problem->feedback[k][i][j]
-                                                  : -problem->gains[k][i][j];
-                u += gain * (states[k][j] - problem->states[k][j]);
-            }
-            inputs[k][i] = within_box(within_rates(u, last, k, i), k, i);
-        }
-        model(states[k], inputs[k], &problem->work, states[k + 1], 0, 0);
-        for (i = 0; i < n && GPMPC_ESTIMATES; i++)
-            states[k + 1][i] += controller->disturbance[i];
-    }
-    if (!all_finite(&states[0][0], (H + 1) * n))
+    copy(&problem->states[0][0], states, (H + 1) * n);
+    copy(&problem->inputs[0][0], inputs, H * m);
+    follow(controller, states, inputs);
+    if (!all_finite(states, (H + 1) * n))
         return;
-    copy(&states[0][0], &problem->states[0][0], (H + 1) * n);
-    copy(&inputs[0][0], &problem->inputs[0][0], H * m);
+    copy(states, &problem->states[0][0], (H + 1) * n);
+    copy(inputs, &problem->inputs[0][0], H * m);
 }
 #endif
 
@@ -1351,7 +1438,7 @@ static int decide(gpmpc_controller *controller, const real *state,
     condense(controller);
     solve(problem, &controller->program, &controller->solution, solution);
 #if GPMPC_ELASTIC
-    lower_elastic_prices(controller);
+    solve_elastic(controller);
 #endif
     status = solution->status;
     if (!is_usable(controller))

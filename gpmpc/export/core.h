@@ -154,7 +154,7 @@ typedef struct {
     gpmpc_real V[GPMPC_STAGES][GPMPC_STATES][GPMPC_STATES];
     gpmpc_real covariances[GPMPC_HORIZON + 1][GPMPC_STATES][GPMPC_STATES];
 #endif
-#if GPMPC_TUBES || GPMPC_ROLLS_OUT
+#if GPMPC_TUBES || GPMPC_ROLLS_OUT || GPMPC_ELASTIC
     gpmpc_real gains[GPMPC_HORIZON][GPMPC_INPUTS][GPMPC_STATES];
 #endif
     /* rows lower <= E s_{k+1} + D u_k <= upper */
@@ -208,7 +208,7 @@ typedef struct {
     gpmpc_program program;
     gpmpc_solution candidate;
 #if GPMPC_ELASTIC
-    gpmpc_solution elastic; /* without the rows that give way */
+    gpmpc_solution elastic; /* under another price of rows that give way */
 #endif
 } gpmpc_controller;
 

@@ -77,6 +77,33 @@ def close_defects(
     return ending._replace(plan=plan, rows=rows, cost=cost)
 
 
+def cost_when_followed(
+    prediction: PredictionModel,
+    planned: LocalProblem,
+    local: LocalProblem,
+    feedback: Array,
+    request: Request,
+) -> float:
+    """Returns what it costs to roll the means out towards a plan.
+
+    It is infinite where that overflows. Where means depend on covariances nothing is
+    rolled out: it is what the plan itself costs.
+
+    Args:
+        prediction: Of the controller.
+        planned: The problem whose plan is followed and whose cost counts.
+        local: The problem that was linearised last, whose feedback is followed.
+        feedback: Of its program; see ``roll_out``.
+        request: Of the decision.
+    """
+    if not prediction.linearizer.depends_on_covariance:
+        plan = _follow(prediction, planned.plan, local, feedback, request)
+        if not np.isfinite(plan.states).all():
+            return np.inf
+        planned = planned._replace(plan=plan)
+    return float(planned.stage_costs(request.references).sum())
+
+
 def cost_of_inputs(
     prediction: PredictionModel, inputs: Array, request: Request
 ) -> float:

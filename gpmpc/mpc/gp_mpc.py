@@ -51,7 +51,7 @@ from gpmpc.mpc._controller import (
     read_parameters,
 )
 from gpmpc.mpc._cost import FunctionNotFinite
-from gpmpc.mpc._elastic import elastic_price, violations
+from gpmpc.mpc._elastic import NO_PRICE, TRIALS, elastic_limits, violations
 from gpmpc.mpc._guess import initial_guess, read_request
 from gpmpc.mpc._linear_quadratic import (
     CondensedProgram,
@@ -61,7 +61,7 @@ from gpmpc.mpc._linear_quadratic import (
 )
 from gpmpc.mpc._linearization import LocalProblem, PredictionModel, PredictionSettings
 from gpmpc.mpc._novelty import data_scales, novelty_of, novelty_when_read
-from gpmpc.mpc._roll_out import close_defects, cost_of_inputs
+from gpmpc.mpc._roll_out import close_defects, cost_of_inputs, cost_when_followed
 from gpmpc.mpc._sqp import FAILURES, Globalization, Iterate, measure_continuity
 from gpmpc.mpc._stability import Stability, stability
 from gpmpc.mpc.problem import Problem
@@ -78,8 +78,6 @@ _LOOSE = 1e-2  # tolerance there
 _TIGHT = 1e-6  # tolerance where it is set
 _PAYS = 0.7  # of a first plan's cost, below which one that took more programs is taken
 _MISS_RATIO = 1.02  # a plan may miss a curved bound by this times what its program did
-# Price of a row that does not count: a free row keeps its place among the others.
-_NEXT_TO_NOTHING = 1e-9
 
 
 class Stopwatch:
@@ -552,8 +550,7 @@ class _ControlStep:
         if is_first and constraints.gives_way and solution.status.solved:
             planned = self._planned(program, solution, local)
             if violations(planned, constraints.elastic).max() > KEPT:
-                self._row_prices = self._lower_elastic_prices(program, solution, local)
-                solution = self._solve_priced(program, solution, self._row_prices)
+                solution = self._solve_elastic(program, solution, local)
         self._programs += 1
         self._warm_start = solution
         return solution
@@ -588,24 +585,84 @@ class _ControlStep:
         )
         return solver.solve(problem, warm_start)
 
-    def _lower_elastic_prices(
+    def _solve_elastic(
         self, program: CondensedProgram, solution: QPSolution, local: LocalProblem
-    ) -> Array:
-        """Returns prices of the rows (r,) for elastic ones that cannot be kept."""
+    ) -> QPSolution:
+        """Returns the solution under the price that elastic rows are worth.
+
+        Args:
+            program: The program.
+            solution: Its solution under the exact price, which misses elastic rows.
+            local: The problem of the program.
+        """
         references = self._request.references
         elastic = self._prediction.constraints.elastic
         prices = self._prediction.constraints.prices.copy()
-        prices[elastic] = _NEXT_TO_NOTHING
+        prices[elastic] = NO_PRICE
         free_solution = self._solve_priced(program, solution, prices)
         free = self._planned(program, free_solution, local)
-        prices[elastic] = elastic_price(
+        limits = elastic_limits(
             free,
             free_cost=float(free.stage_costs(references).sum()),
             last_cost=float(local.stage_costs(references).sum()),
             elastic=elastic,
             Q=self._prediction.problem.cost.Q,
         )
-        return prices
+        free_cost = self._cost_when_followed(program, free_solution, local)
+        affordable_cost = free_cost + limits.extra_cost
+        if not math.isfinite(affordable_cost):
+            affordable_cost = -math.inf
+        if self._cost_when_followed(program, solution, local) <= affordable_cost:
+            return solution
+        return self._raise_elastic_price(
+            program, solution, local, limits.least_price, affordable_cost
+        )
+
+    def _raise_elastic_price(
+        self,
+        program: CondensedProgram,
+        solution: QPSolution,
+        local: LocalProblem,
+        least_price: float,
+        affordable_cost: float,
+    ) -> QPSolution:
+        """Returns the solution under the highest price whose plan is affordable.
+
+        It is the highest of a few between the least price and the exact one, and the
+        least one where none of them is.
+        """
+        elastic = self._prediction.constraints.elastic
+        prices = self._prediction.constraints.prices.copy()
+        highest_price = float(prices[elastic].max())
+        price = min(least_price, highest_price)
+        best = None
+        for _ in range(TRIALS):
+            middle = math.sqrt(price * highest_price)
+            prices[elastic] = middle
+            trial = self._solve_priced(program, best or solution, prices)
+            cost = self._cost_when_followed(program, trial, local)
+            if trial.status.solved and cost <= affordable_cost:
+                price = middle
+                best = trial
+            else:
+                highest_price = middle
+        prices[elastic] = price
+        self._row_prices = prices
+        if best is None:
+            return self._solve_priced(program, solution, prices)
+        return best
+
+    def _cost_when_followed(
+        self, program: CondensedProgram, solution: QPSolution, local: LocalProblem
+    ) -> float:
+        """Returns what the plan of a solution costs the model, rolled out along it."""
+        planned = self._planned(program, solution, local)
+        try:
+            return cost_when_followed(
+                self._prediction, planned, local, program.feedback, self._request
+            )
+        except FAILURES:
+            return math.inf
 
     def _take_step(
         self, local: LocalProblem, program: CondensedProgram, solution: QPSolution
