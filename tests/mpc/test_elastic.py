@@ -15,14 +15,14 @@ from tests.mpc.small_models import LinearGaussian
 H = 12
 
 
-def planned(penalty, start, goal=0.0, upper=0.5, form="trajectory"):
+def planned(penalty, start, goal=0.0, upper=0.5, form="trajectory", push=50.0):
     """A cart's plan whose position is to stay below a bound; the push costs next to
     nothing."""
     settings = {} if penalty in ("default", "free") else {"penalty": penalty}
     bound = Box([-np.inf, -np.inf], [upper, np.inf], **settings)
     problem = Problem(
         Tracking([1.0, 0.1], [0.01], penalized="inputs"),
-        Box([-50.0], [50.0]),
+        Box([-push], [push]),
         constraints=[] if penalty == "free" else [bound],
     )
     model = LinearGaussian([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]])
@@ -57,6 +57,18 @@ def test_where_it_cannot_its_price_cannot_outweigh_the_cost(start, form):
     assert exact.cost > 1.2 * elastic.cost
     assert outside.sum() < missed.sum()
     assert np.abs(elastic.inputs).max() < np.abs(exact.inputs).max()
+
+
+@pytest.mark.parametrize("form", ["trajectory", "velocity"])
+def test_a_bound_that_is_cheap_is_as_dear_as_an_exact_one(form):
+    """Where pushes are small the cost asks for nearly the fastest return anyway."""
+    free, elastic, exact = (
+        planned(p, [0.8, 1.0], form=form, push=3.0)
+        for p in ("free", "default", "exact")
+    )
+    assert exact.cost < 1.04 * free.cost
+    assert elastic.status is Status.SOFT_BOUND_MISSED
+    np.testing.assert_allclose(elastic.inputs, exact.inputs, atol=1e-9)
 
 
 def test_a_reference_beyond_a_bound_does_not_make_it_free():
