@@ -256,6 +256,25 @@ COMMANDS = {
                 default="double",
                 help="of all numbers (double)",
             ),
+            _argument(
+                "--budget",
+                metavar="LIMITS",
+                help="what the code may take, such as "
+                "flash=64kB,ram=32kB,instructions=2M: as many points are kept as fit, "
+                "and a table shows what fewer cost",
+            ),
+            _argument(
+                "--chip",
+                choices=["cortex-m4f", "cortex-m7", "host"],
+                help="that the budget is measured for (cortex-m4f where "
+                "arm-none-eabi-gcc is installed, else host)",
+            ),
+            _argument(
+                "--points",
+                type=int,
+                metavar="N",
+                help="how many points are kept, those that explain most (all)",
+            ),
             _TRUST,
         ],
     ),

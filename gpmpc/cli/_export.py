@@ -1,6 +1,7 @@
 """``gpmpc export c``: writes the controller of a recorded run as C.
 
     run -> its experiment -> its model, learned again -> the controller -> C, replay
+                                                              |_ points by a budget
 
 A model that was trained before the run is taken as it is.
 """
@@ -14,7 +15,9 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from gpmpc._files import write_whole
 from gpmpc.cli._commands import Result
+from gpmpc.cli._export_points import KeptPoints, budget_of, kept_points
 from gpmpc.cli._folders import writing
 from gpmpc.cli._recorded import errors_of_settings, experiment_of_run, recordings
 from gpmpc.exceptions import DataError, SettingError
@@ -34,24 +37,29 @@ from gpmpc.studies.study import one_thread
 def export(arguments: argparse.Namespace) -> Result:
     """Writes a controller as C, and replays its flight by it."""
     console = Console()
+    budget = budget_of(arguments)
     path = _only_recording(arguments.run)
     run = read_run(path)
     experiment = experiment_of_run(run, arguments.trust)
     folder = arguments.to or path.parent / "c"
     with console.status("learning"):
         controller = _controller_of(run, experiment)
+    kept = kept_points(console, controller, experiment, budget, arguments)
     policy: Any = experiment.on_failure
+    precision = arguments.precision
+    questions = list(_questions(run, experiment, controller))
     with writing(folder, "to"):
-        export_c(controller, folder, arguments.precision, policy)
-        questions = list(_questions(run, experiment, controller))
-        steps = write_replay(controller, questions, folder / "replay.txt", policy)
+        export_c(controller, folder, precision, policy, points=kept.points)
+        steps = write_replay(kept.controller, questions, folder / "replay.txt", policy)
+        _write_points(folder / "points.md", kept, arguments.budget)
     lines = [
         f"written to {folder}: src/gpmpc.h, src/gpmpc.c, and a replay of {steps} steps"
     ]
-    data: dict[str, Any] = {"folder": str(folder), "steps": steps}
+    lines += kept.lines
+    data = {"folder": str(folder), "steps": steps, **kept.data}
     if shutil.which("cc"):
         with console.status("compiling"):
-            data |= _measure(controller, questions, arguments.precision, policy)
+            data |= _measure(kept.controller, questions, precision, policy)
         lines += [
             f"memory            {data['memory_bytes'] / 1024:.0f} kB of one controller",
             f"a step, here      median {data['median_us']:.0f} us, "
@@ -63,6 +71,14 @@ def export(arguments: argparse.Namespace) -> Result:
         lines.append("not compiled: there is no cc on this machine")
     console.out(*lines, sep="\n", highlight=False)
     return Result(data)
+
+
+def _write_points(path: Path, kept: KeptPoints, budget: str) -> None:
+    """Writes how many points are kept; an older page goes where all are."""
+    if kept.points is None:
+        path.unlink(missing_ok=True)
+    else:
+        write_whole(path, kept.document(budget))
 
 
 def _only_recording(path: Path) -> Path:

@@ -1,16 +1,19 @@
 """Writes a controller as one header and one source in C99."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from gpmpc._calls import explains_arguments
+from gpmpc._dynamics import DynamicsModel
 from gpmpc._files import write_whole
+from gpmpc.estimation import KalmanFilter
 from gpmpc.exceptions import check_choice
 from gpmpc.export._checks import check_exportable
 from gpmpc.export._filter import Estimator, FilterWriter, check_estimator
 from gpmpc.export._functions import FunctionWriter
 from gpmpc.export._models import ModelWriter
+from gpmpc.export._points import posterior_of, with_points
 from gpmpc.export._problems import definitions, needs_means_alone, tables, tightens
 from gpmpc.export._text import Numbers, Precision, comment
 from gpmpc.mpc import GPMPC
@@ -44,6 +47,7 @@ def export_c(
     precision: Precision = "double",
     on_failure: str = "previous_plan",
     estimator: Estimator | None = None,
+    points: int | None = None,
 ) -> Export:
     """Writes a controller as C into a folder.
 
@@ -61,16 +65,55 @@ def export_c(
             ``"hold"``; see ``ControlLoop``.
         estimator: A filter of which the code decides for the belief: a step is then
             given what sensors show. Without one it is given the state.
+        points: How many points its GPs keep, those that explain most; the header says
+            so. None keeps all. See ``with_points`` and ``choose_points``.
 
     Raises:
         SettingError: Controller or filter have a part that C cannot hold; it is named.
     """
     folder = Path(path)
-    export = write_code(controller, folder / "src", precision, on_failure, estimator)
+    notes: list[str] = []
+    if points is not None:
+        check_exportable(controller, on_failure)
+        model = controller.prediction.model
+        controller, estimator = _with_points(controller, estimator, points)
+        notes.append(_note_of_points(controller.prediction.model, model))
+    export = write_code(
+        controller, folder / "src", precision, on_failure, estimator, notes
+    )
     for place, name in _AROUND.items():
         (folder / place).parent.mkdir(parents=True, exist_ok=True)
         write_whole(folder / place, (_HERE / "around" / name).read_text())
     return export
+
+
+def _with_points(
+    controller: GPMPC, estimator: Estimator | None, points: int
+) -> tuple[GPMPC, Estimator | None]:
+    """Returns controller and filter of fewer points.
+
+    A filter with a model of its own keeps that one.
+    """
+    model = controller.prediction.model
+    reduced = with_points(model, points)
+    if estimator is not None:
+        check_estimator(controller, estimator)
+        kalman = estimator.filter
+        if kalman.model is model:
+            filter = KalmanFilter(
+                reduced, kalman.measurement, kalman.propagator, kalman.observer
+            )
+            estimator = estimator._replace(filter=filter)
+    return controller.with_model(reduced), estimator
+
+
+def _note_of_points(reduced: DynamicsModel, model: DynamicsModel) -> str:
+    """Returns the line that says how many points are kept."""
+    points = len(posterior_of(reduced))
+    size = len(posterior_of(model))
+    if points == size:
+        return f"points: all {size} of the model"
+    return f"points: {points} of the {size} of the model, those that explain most"
 
 
 def write_code(
@@ -79,13 +122,16 @@ def write_code(
     precision: Precision,
     on_failure: str,
     estimator: Estimator | None = None,
+    notes: Sequence[str] = (),
 ) -> Export:
-    """Writes header and source alone; see ``export_c``."""
+    """Writes header and source alone, notes in their heads; see ``export_c``."""
     check_choice("precision", precision, ("double", "float"))
     check_exportable(controller, on_failure)
     if estimator is not None:
         check_estimator(controller, estimator)
-    header, source = _texts(controller, Numbers(precision), on_failure, estimator)
+    header, source = _texts(
+        controller, Numbers(precision), on_failure, estimator, notes
+    )
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / "gpmpc.h", header)
     write_whole(folder / "gpmpc.c", source)
@@ -97,6 +143,7 @@ def _texts(
     numbers: Numbers,
     on_failure: str,
     estimator: Estimator | None,
+    notes: Sequence[str],
 ) -> tuple[str, str]:
     """Returns header and source."""
     functions = FunctionWriter(controller, numbers)
@@ -125,7 +172,7 @@ def _texts(
         "qp": _part("qp.c").replace("/*{rescue}*/", _part("rescue.c")),
         "filter": _part("filter.c") if estimator is not None else "",
     }
-    names = _names(controller, estimator)
+    names = [*_names(controller, estimator), *notes]
     header = _header(settings.text(), numbers, names)
     return header, _source(parts, names)
 
