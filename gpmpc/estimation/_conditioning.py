@@ -75,8 +75,8 @@ def covariance_root(covariance: Tensor) -> Tensor:
     return torch.where(singular[..., None, None], root, factor)
 
 
-def seen_through(root: Tensor, cross_covariance: Tensor) -> Tensor:
-    """Computes Y (*batch, p, n) of Cov[x, y] = L Y' (*batch, n, p).
+def whitened_cross_covariance(root: Tensor, cross_covariance: Tensor) -> Tensor:
+    """Computes Y = Cov[y, x] L'^-1 (*batch, p, n), for Cov[x, y] = L Y' (*batch, n, p).
 
     It is the least one if L is singular. Y = H L where the measurement is linear, and
     the best linear one elsewhere.
@@ -92,14 +92,14 @@ def seen_through(root: Tensor, cross_covariance: Tensor) -> Tensor:
     return (torch.linalg.pinv(inverse * root) @ (inverse * cross_covariance)).mT
 
 
-def unexplained(covariance: Tensor, seen: Tensor) -> Tensor:
-    """Computes the part of Cov[y] (*batch, p, p) that Y does not explain.
+def unexplained_covariance(covariance: Tensor, H_root: Tensor) -> Tensor:
+    """Computes the part of Cov[y] (*batch, p, p) that Y = H L does not explain.
 
     That is the error of linearisation.
 
     Entries that are round-off of Cov[y] are zero.
     """
-    remainder = covariance - seen @ seen.mT
+    remainder = covariance - H_root @ H_root.mT
     remainder = (remainder + remainder.mT) / 2
     sizes = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
     eps = torch.finfo(covariance.dtype).eps
@@ -107,25 +107,25 @@ def unexplained(covariance: Tensor, seen: Tensor) -> Tensor:
     return torch.where(remainder.abs() <= round_off, 0.0, remainder)
 
 
-def condition(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
-    """Conditions a Gaussian of root L on a measurement that sees it through Y.
+def condition(root: Tensor, H_root: Tensor, noise: Tensor) -> Conditioned:
+    """Conditions a Gaussian of root L on a measurement y = H x + v.
 
     Args:
         root: L (*batch, n, n).
-        seen: Y = H L (*batch, p, n); a row of zeros shows nothing.
+        H_root: Y = H L (*batch, p, n); a row of zeros shows nothing.
         noise: N (*batch, p, p), positive semidefinite: zero for what is measured
             exactly.
     """
-    batch = seen.shape[:-2]
-    p, n = seen.shape[-2:]
+    batch = H_root.shape[:-2]
+    p, n = H_root.shape[-2:]
     noise = noise.expand(*batch, p, p)
     root = root.expand(*batch, n, n)
     noise_root, info = torch.linalg.cholesky_ex(noise)
     deviations = noise_root.diagonal(dim1=-2, dim2=-1)
-    nearly_perfect = (p > 1) & (deviations <= _PERFECT * seen.norm(dim=-1))
+    nearly_perfect = (p > 1) & (deviations <= _PERFECT * H_root.norm(dim=-1))
     if bool((info > 0).any() | nearly_perfect.any()):
-        return _one_by_one(root, seen, noise)
-    of_prior = torch.cat([seen.mT, root.mT], dim=-1)
+        return _one_by_one(root, H_root, noise)
+    of_prior = torch.cat([H_root.mT, root.mT], dim=-1)
     of_noise = torch.cat([noise_root.mT, root.new_zeros(*batch, p, n)], dim=-1)
     triangular = torch.linalg.qr(torch.cat([of_prior, of_noise], dim=-2), mode="r").R.mT
     innovation_root = triangular[..., :p, :p]
@@ -135,25 +135,27 @@ def condition(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
     return Conditioned(gain=gain, root=triangular[..., p:, p:])
 
 
-def _one_by_one(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
+def _one_by_one(root: Tensor, H_root: Tensor, noise: Tensor) -> Conditioned:
     """Conditions by one scalar measurement after the other, also perfect ones."""
-    batch = seen.shape[:-2]
-    p = seen.shape[-2]
-    unit_lower, variances = _decorrelated(noise)
+    batch = H_root.shape[:-2]
+    p = H_root.shape[-2]
+    unit_lower, variances = decorrelated(noise)
     rows = torch.linalg.solve_triangular(
-        unit_lower, seen, upper=False, unitriangular=True
+        unit_lower, H_root, upper=False, unitriangular=True
     )
-    round_off = _ROUND_OFF * torch.finfo(seen.dtype).eps * rows.norm(dim=-1)
+    round_off = _ROUND_OFF * torch.finfo(H_root.dtype).eps * rows.norm(dim=-1)
     # What is measured and the states are corrected alike: rows of one matrix.
     factor = torch.cat([rows, root], dim=-2)
     gains = factor.new_zeros(*batch, factor.shape[-2], p)
-    innovations = torch.eye(p, dtype=seen.dtype, device=seen.device)
+    unit_innovations = torch.eye(p, dtype=H_root.dtype, device=H_root.device)
     for i in range(p):
         row = factor[..., i, :]
         variance = variances[..., i]
         row = torch.where(row.abs() <= round_off[..., i, None], 0.0, row)
         weights, factor = _corrected(factor, row, variance)
-        innovation = innovations[i] - gains[..., i, :]
+        # How the i-th decorrelated innovation depends on all p; what earlier sensors
+        # have corrected already (row i of the gains) is subtracted.
+        innovation = unit_innovations[i] - gains[..., i, :]
         gains = gains + weights[..., :, None] * innovation[..., None, :]
     gain = torch.linalg.solve_triangular(
         unit_lower, gains[..., p:, :], upper=False, left=False, unitriangular=True
@@ -163,6 +165,9 @@ def _one_by_one(root: Tensor, seen: Tensor, noise: Tensor) -> Conditioned:
 
 def _corrected(factor: Tensor, row: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
     """Corrects everything by one scalar measurement.
+
+    The vector that is reflected is (row, sqrt(variance)). In its last column the factor
+    is zero: so only ``row`` is stored.
 
     Args:
         factor: A row of what is corrected each (*batch, q, n).
@@ -195,7 +200,7 @@ def _corrected(factor: Tensor, row: Tensor, variance: Tensor) -> tuple[Tensor, T
     return gains, corrected
 
 
-def _decorrelated(noise: Tensor) -> tuple[Tensor, Tensor]:
+def decorrelated(noise: Tensor) -> tuple[Tensor, Tensor]:
     """Factorises N = T diag(d) T'.
 
     Returns:

@@ -44,7 +44,13 @@ from gpmpc._angles import angles_of, full_turns, state_difference
 from gpmpc._calls import explains_arguments
 from gpmpc._compiled import compiled
 from gpmpc._dynamics import Array, DynamicsModel, to_array
-from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
+from gpmpc.exceptions import (
+    DataError,
+    SettingError,
+    ShapeError,
+    check_indices,
+    check_number,
+)
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import Propagator, rollout
 
@@ -53,6 +59,10 @@ from gpmpc.propagation import Propagator, rollout
 @dataclass(frozen=True)
 class ConformalTube:
     """Scores of held-out predictions, and the standard deviations that follow.
+
+    Raises:
+        ShapeError: Scores or rows are no table of a row and a column.
+        SettingError: An angle is no state.
 
     See Also:
         ``AdaptiveTube``, which follows what happens in flight.
@@ -63,9 +73,11 @@ class ConformalTube:
     angles: Sequence[int] = ()  #: states whose errors are taken within half a turn
 
     def __post_init__(self) -> None:
-        scores = np.sort(self.scores, axis=0)
-        object.__setattr__(self, "scores", np.ascontiguousarray(scores, dtype=float))
-        object.__setattr__(self, "rows", np.ascontiguousarray(self.rows, dtype=float))
+        scores = np.sort(_table("scores", self.scores, "(N, H)"), axis=0)
+        rows = _table("rows", self.rows, "(r, n)")
+        check_indices("angles", self.angles, rows.shape[1])
+        object.__setattr__(self, "scores", scores)
+        object.__setattr__(self, "rows", rows)
 
     @classmethod
     def calibrate(
@@ -177,6 +189,7 @@ class AdaptiveTube:
     Raises:
         SettingError: A probability not between 0 and 1, a rate that is not positive, or
             too few decisions to say so.
+        ShapeError: The noise is no matrix (n, n).
 
     See Also:
         ``ConformalTube``, which it begins with.
@@ -205,7 +218,7 @@ class AdaptiveTube:
         self.largest = float(largest)
         self.noise = np.zeros((n, n))
         if noise is not None:
-            self.noise = np.ascontiguousarray(noise, dtype=float)
+            self.noise = _of_shape("noise", noise, (n, n))
         self.allowed = np.full(H, 1.0 - probability)  # a of each stage
         if decisions is not None:
             self.allowed = _aimed_misses(probability, rate, decisions, H)
@@ -220,13 +233,27 @@ class AdaptiveTube:
         # So states and plans are moved by whole turns to where this state, the last
         # one, goes on without jumps.
         self._last_state = np.full(n, np.nan)
-        self.observe(np.full(n, np.nan))  # nothing yet: kappas alone
-        self._step = 0
+        self._compare(np.full(n, np.nan))  # nothing yet: kappas alone
 
     def observe(self, state: Any) -> Array:
-        """Compares a state (n,) with the plans before it; returns kappas (H,)."""
-        state = self._without_jumps(np.ascontiguousarray(state, dtype=np.float64))
+        """Compares a state (n,) with the plans before it; returns kappas (H,).
+
+        Raises:
+            ShapeError: It has another number of entries.
+        """
+        state = _of_shape("a state", state, (self.tube.rows.shape[1],))
+        state = self._without_jumps(state)
         self._step += 1
+        self._compare(state)
+        return self.kappas
+
+    def _compare(self, state: Array) -> None:
+        """Compares a state (n,) with the plans before it, and adapts kappas."""
+        # New arrays: what was handed out before stays as it is.
+        self.kappas = self.kappas.copy()
+        self.alphas = self.alphas.copy()
+        self.counts = self.counts.copy()
+        self.misses = self.misses.copy()
         _observe.unchecked(
             state,
             self.tube.rows,
@@ -236,7 +263,6 @@ class AdaptiveTube:
             self.tube.scores,
             _StageState(self.kappas, self.alphas, self.counts, self.misses),
         )
-        return self.kappas
 
     def remember(self, means: Array, covariances: Array, stages: Any = None) -> None:
         """Remembers a plan from the current state on.
@@ -247,15 +273,24 @@ class AdaptiveTube:
             stages: Whether each stage's prediction counts (H,), or each of its
                 directions (H, r), such as where the plan touches a bound: how often
                 bounds are violated there is what alpha follows then. By default all do.
+
+        Raises:
+            ShapeError: One of them has another shape.
         """
-        means = np.ascontiguousarray(means, dtype=np.float64)
-        covariances = np.ascontiguousarray(covariances, dtype=np.float64)
-        expected = self.tube.horizon + 1, self.tube.rows.shape[1]
-        if means.shape != expected:
-            raise ShapeError(f"means must be {expected}; got {means.shape}")
+        H = self.tube.horizon
+        r, n = self.tube.rows.shape
+        means = _of_shape("means", means, (H + 1, n))
+        covariances = _of_shape("covariances", covariances, (H + 1, n, n))
+        counts = np.full((H, r), True)
+        if stages is not None:
+            counts = np.array(stages, dtype=bool)
+            if counts.shape not in ((H,), (H, r)):
+                raise ShapeError(
+                    f"stages must be ({H},) or {(H, r)}; got {counts.shape}"
+                )
         if len(self.tube.angles) and np.isfinite(self._last_state).all():
             means = means + full_turns(self._last_state - means[0], self.tube.angles)
-        bounds = self._bounds[self._step % self.tube.horizon]
+        bounds = self._bounds[self._step % H]
         _remember.unchecked(
             means,
             covariances,
@@ -264,8 +299,7 @@ class AdaptiveTube:
             self.kappas,
             bounds,
         )
-        if stages is not None:
-            bounds[~np.asarray(stages, dtype=bool)] = np.nan
+        bounds[~counts] = np.nan
 
     def _without_jumps(self, state: Array) -> Array:
         """Moves the angles of a state (n,) to within half a turn of the last ones."""
@@ -289,6 +323,30 @@ class AdaptiveTube:
 
 def _as_rows(rows: Any) -> Array:
     return np.atleast_2d(np.asarray(rows, dtype=float))
+
+
+def _table(name: str, values: Any, dimensions: str) -> Array:
+    """Copies numbers of two dimensions, each of one entry or more.
+
+    Raises:
+        ShapeError: They have others.
+    """
+    table = np.array(values, dtype=np.float64, order="C")
+    if table.ndim != 2 or not table.size:
+        raise ShapeError(f"{name} must be {dimensions}; got {table.shape}")
+    return table
+
+
+def _of_shape(name: str, values: Any, shape: tuple[int, ...]) -> Array:
+    """Copies numbers to a contiguous array, as compiled code reads it unchecked.
+
+    Raises:
+        ShapeError: They have another shape.
+    """
+    array = np.array(values, dtype=np.float64, order="C")
+    if array.shape != shape:
+        raise ShapeError(f"{name} must be {shape}; got {array.shape}")
+    return array
 
 
 def _check_probability(probability: float) -> None:
@@ -352,20 +410,21 @@ def _observe(state, rows, bounds, step, adaptation, scores, stages):
     for k in range(H):
         # The plan of k + 1 steps ago said where the state would be at its stage k.
         # A bound that does not count is NaN.
-        counted = False
-        known = True
-        outside = False
+        any_bound_counts = False
+        is_measured = True
+        is_violated = False
         plan = (step - k - 1) % H
         for r in range(len(rows)):
             value = 0.0
             for i in range(len(state)):
                 value += rows[r, i] * state[i]
             bound = bounds[plan, k, r]
-            counted = counted or bound == bound
-            known = known and (bound != bound or value == value)
-            outside = outside or value > bound
-        if counted and known:
-            miss = 1.0 if outside else 0.0
+            counts = bound == bound
+            any_bound_counts = any_bound_counts or counts
+            is_measured = is_measured and (not counts or value == value)
+            is_violated = is_violated or value > bound
+        if any_bound_counts and is_measured:
+            miss = 1.0 if is_violated else 0.0
             stages.counts[k] += 1.0
             stages.misses[k] += miss
             change = adaptation.rate * (adaptation.allowed[k] - miss)

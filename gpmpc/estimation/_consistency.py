@@ -18,7 +18,8 @@ from torch import Tensor
 
 from gpmpc._angles import state_difference
 from gpmpc._calls import explains_arguments
-from gpmpc.exceptions import DataError, ShapeError
+from gpmpc.estimation._conditioning import decorrelated
+from gpmpc.exceptions import DataError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 
 
@@ -31,12 +32,10 @@ class Consistency:
     """
 
     values: np.ndarray  #: one an error (N,); errors without a finite entry are left out
-    degrees: (
-        np.ndarray
-    )  #: degrees of freedom of each: how many entries were finite (N,)
-    band: tuple[
-        float, float
-    ]  #: limits of the mean, per degree of freedom, for independent errors
+    #: degrees of freedom of each: how many entries were finite (N,)
+    degrees: np.ndarray
+    #: limits of the mean, per degree of freedom, for independent errors
+    band: tuple[float, float]
 
     @property
     def mean(self) -> float:
@@ -68,7 +67,8 @@ def normalized_errors(
 
     Raises:
         ShapeError: The two do not belong together.
-        DataError: No error is finite.
+        DataError: No error is finite, or a covariance is singular: the chi-square of
+            such an error is not defined.
 
     >>> import numpy as np
     >>> errors = np.random.default_rng(0).normal(size=(500, 2))
@@ -97,11 +97,15 @@ def normalized_errors(
     e = e[measured]
     P = P[measured]
     missing = missing[measured]
-    # A missing entry counts as an error of zero that is independent of the others.
-    in_missing = missing[:, :, None] | missing[:, None, :]
-    P = torch.where(in_missing, torch.eye(n, dtype=P.dtype), P)
+    P = _with_independent(P, missing)
     e = torch.where(missing, 0.0, e)
-    values = (e * torch.linalg.solve(P, e[..., None])[..., 0]).sum(-1).numpy()
+    solutions, info = torch.linalg.solve_ex(P, e[..., None])
+    if bool(info.any()):
+        raise DataError(
+            "the covariances must be positive definite; got a singular one: leave out "
+            "entries that are known exactly"
+        )
+    values = (e * solutions[..., 0]).sum(-1).numpy()
     degrees = (~missing).sum(-1).numpy()
     count = len(values) if independent is None else independent
     total = float(degrees.mean()) * count
@@ -133,10 +137,21 @@ def autocorrelation(
 ) -> tuple[float, float]:
     """Computes the autocorrelation of whitened innovations (T, p).
 
+    Whitened are L^-1 nu with S = L L', L lower triangular: of entries whose errors are
+    correlated each counts by what the ones before it do not say already. An entry that
+    was not measured, or of which S leaves no variance, does not count.
+
+    Args:
+        innovations: nu (T, p); entries that are not finite were not measured.
+        covariances: S (T, p, p).
+        lag: Steps between the two of a pair.
+
     Returns:
         The autocorrelation, and the 95 % limit of its size where they are white.
 
     Raises:
+        ShapeError: The two do not belong together.
+        SettingError: The lag is no whole number of one or more.
         DataError: Fewer than two pairs are finite.
 
     >>> import numpy as np
@@ -150,7 +165,13 @@ def autocorrelation(
     """
     e = torch.as_tensor(innovations, dtype=torch.float64)
     S = torch.as_tensor(covariances, dtype=torch.float64)
-    white = (e / S.diagonal(dim1=-2, dim2=-1).sqrt()).numpy()
+    if e.dim() != 2 or S.shape != (*e.shape, e.shape[1]):
+        raise ShapeError(
+            f"innovations (T, p) need covariances (T, p, p); got {tuple(e.shape)} and "
+            f"{tuple(S.shape)}"
+        )
+    check_number("lag", lag, least=1, whole=True)
+    white = _whitened(e, S).numpy()
     first = white[:-lag]
     second = white[lag:]
     pairs = np.isfinite(first) & np.isfinite(second)
@@ -163,3 +184,29 @@ def autocorrelation(
     correlation = (a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum())
     limit = 1.96 / np.sqrt(len(a))
     return float(correlation), float(limit)
+
+
+def _whitened(errors: Tensor, covariances: Tensor) -> Tensor:
+    """Computes L^-1 e (T, p) with S = L L'; NaN where nothing was measured.
+
+    Args:
+        errors: e (T, p), not finite where nothing was measured.
+        covariances: S (T, p, p).
+    """
+    missing = ~torch.isfinite(errors)
+    unit_lower, variances = decorrelated(_with_independent(covariances, missing))
+    independent = torch.linalg.solve_triangular(
+        unit_lower,
+        torch.where(missing, 0.0, errors)[..., None],
+        upper=False,
+        unitriangular=True,
+    )[..., 0]
+    unknown = missing | (variances <= 0)
+    return torch.where(unknown, torch.nan, independent / variances.sqrt())
+
+
+def _with_independent(covariances: Tensor, missing: Tensor) -> Tensor:
+    """Makes missing entries (T, p) of covariances (T, p, p) independent of others."""
+    in_missing = missing[:, :, None] | missing[:, None, :]
+    eye = torch.eye(covariances.shape[-1], dtype=covariances.dtype)
+    return torch.where(in_missing, eye, covariances)

@@ -29,6 +29,7 @@ from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import (
     DataError,
+    SettingError,
     ShapeError,
     check_indices,
     check_number,
@@ -71,15 +72,18 @@ def estimate_delay(
         states: x_0 .. x_T of one log at equal time steps (T + 1, n).
         inputs: u_0 .. u_{T-1} (T, m) or one more; they must move independently of the
             state now and then.
-        longest: The longest delay that is tried [steps].
-        resolution: Steps between two delays that are tried; 1 for whole ones only.
-        confidence: Of the interval.
-        resamples: How often blocks of rows are drawn again for the interval.
+        longest: No longer delay is tried [steps].
+        resolution: Steps between two delays that are tried, from zero on; 1 for whole
+            ones only.
+        confidence: Of the interval, between 0 and 1.
+        resamples: How often blocks of rows are drawn again for the interval; once at
+            least.
         seed: Of the draws.
         angles: Indices of the states that are angles [rad], which a sensor may show
             within a turn.
 
     Raises:
+        SettingError: A number is out of range, or an angle is no state.
         ShapeError: The two do not belong together.
         DataError: There are too few rows, or an entry is not finite; or the data cannot
             tell: no state changes, an input is constant, two of them move alike, or
@@ -98,6 +102,11 @@ def estimate_delay(
     u = np.asarray(inputs, dtype=float)
     check_number("longest", longest, least=1, whole=True)
     check_number("resolution", resolution, above=0)
+    check_number("resamples", resamples, least=1, whole=True)
+    check_number("seed", seed, least=0, whole=True)
+    check_number("confidence", confidence)
+    if not 0 < confidence < 1:
+        raise SettingError("confidence", f"must lie between 0 and 1; got {confidence}")
     if x.ndim != 2 or u.ndim != 2 or len(u) not in (len(x) - 1, len(x)):
         raise ShapeError(
             "states (T + 1, n) and inputs (T, m) must be one log; "
@@ -151,9 +160,9 @@ def estimate_delay(
 
 
 def _delays(longest: int, resolution: float) -> Array:
-    """The delays that are tried (T,) [steps]."""
-    delays = np.arange(0, longest + resolution / 2, resolution)
-    return delays.astype(np.float64).round(9)
+    """The delays that are tried (T,) [steps], from zero to at most ``longest``."""
+    count = int(np.floor(longest / resolution + 1e-9)) + 1
+    return (np.arange(count) * float(resolution)).round(9)
 
 
 def _independent_changes(changes: Array, state_basis: Array) -> Array:
@@ -196,6 +205,8 @@ def _block_grams(
     table = np.column_stack([state_basis, regressors, changes])
     length = int(np.ceil(len(rows) ** (1 / 3)) * 2)
     starts = np.arange(0, len(rows) - length + 1, length)
+    # The last block ends with the log; up to length - 1 rows before it are used by
+    # none.
     starts[-1] = len(rows) - length
     blocks = np.stack([table[start : start + length] for start in starts])
     return blocks.swapaxes(1, 2) @ blocks

@@ -18,7 +18,7 @@ sensor's noise, and a sensor perfect.
 from collections import deque
 from collections.abc import Callable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -41,9 +41,9 @@ from gpmpc._functions import call
 from gpmpc.estimation._conditioning import (
     condition,
     covariance_root,
-    seen_through,
     squared,
-    unexplained,
+    unexplained_covariance,
+    whitened_cross_covariance,
 )
 from gpmpc.exceptions import (
     SettingError,
@@ -79,14 +79,11 @@ class Measurement(TensorModel):
 
     state_dim: int  #: n, of the state
     noise_covariance: Tensor  #: R (p, p)
-    function: Callable[
-        [Tensor], Tensor
-    ]  #: h, from x (*batch, n) to y (*batch, p), in torch
-    angles: Sequence[
-        int
-        #: entries of y that are angles [rad]: their differences are taken within half a
-        #: turn
-    ] = ()
+    #: h, from x (*batch, n) to y (*batch, p), in torch
+    function: Callable[[Tensor], Tensor]
+    #: entries of y that are angles [rad]: their differences are taken within half a
+    #: turn
+    angles: Sequence[int] = ()
     input_dim = 0
     _part = property(lambda self: self.noise_covariance)
 
@@ -111,7 +108,7 @@ class Measurement(TensorModel):
         std: Sequence[float],
         angles: Sequence[int] = (),
     ) -> "Measurement":
-        """Measures some of n states.
+        """Measures some of n states, in float64.
 
         Args:
             state_dim: n.
@@ -245,8 +242,8 @@ class KalmanFilter:
             to the update, which adds it.
 
     Raises:
-        SettingError: Model and measurement have different states, or the propagator
-            adds no process noise.
+        SettingError: Model and measurement have different states, another type or
+            device, or the propagator adds no process noise.
 
     See Also:
         ``Measurement``; ``LateMeasurements`` for those that come late; ``smooth`` for
@@ -272,6 +269,7 @@ class KalmanFilter:
             raise SettingError(
                 "measurement", f"must be of as many states as the model has; got {got}"
             )
+        _check_same_type(model, measurement)
         if not getattr(propagator, "process_noise", True):
             rule = "must add the process noise, as Linearization() does"
             raise SettingError(
@@ -301,8 +299,7 @@ class KalmanFilter:
         """Moves a belief (*batch, n) on by a step with an applied input (*batch, m)."""
         check_kind("belief", belief, Gaussian, "a Gaussian")
         belief = belief.in_order(self._names.state_names)
-        acting = _like(belief, "input", input, self._names.input_names)
-        return self.propagator(self.model, belief, acting)
+        return self.propagator(self.model, belief, self._as_input(belief, input))
 
     def update(self, belief: Gaussian, measured: Any) -> Update:
         """Corrects a belief (*batch, n) by a measurement y (*batch, p).
@@ -314,13 +311,8 @@ class KalmanFilter:
         """
         check_kind("belief", belief, Gaussian, "a Gaussian")
         belief = belief.in_order(self._names.state_names)
-        y = _like(belief, "a measurement", measured, self._measured_names)
+        y = self._as_measurement(belief, measured)
         R = self.measurement.noise_covariance
-        expected = (*belief.mean.shape[:-1], len(R))
-        if y.shape != expected:
-            raise ShapeError(
-                f"a measurement must have shape {expected}; got {tuple(y.shape)}"
-            )
         view = self._view(belief)
         missing = ~torch.isfinite(y)
         innovation = state_difference(y, view.mean, self.measurement.angles)
@@ -328,8 +320,8 @@ class KalmanFilter:
         unrelated = missing[..., None] | missing[..., None, :]
         eye = torch.eye(len(R)).to(R)
         noise = torch.where(unrelated, eye, view.linearization_error + R)
-        seen = torch.where(missing[..., None], 0.0, view.seen)
-        posterior = condition(view.root, seen, noise)
+        H_root = torch.where(missing[..., None], 0.0, view.H_root)
+        posterior = condition(view.root, H_root, noise)
         correction = posterior.gain @ torch.where(missing, 0.0, innovation)[..., None]
         corrected = Gaussian(belief.mean + correction[..., 0], posterior.covariance)
         return Update(
@@ -338,29 +330,47 @@ class KalmanFilter:
             covariance=view.covariance + R,
         )
 
+    def _as_input(self, belief: Gaussian, input: Any) -> Tensor:
+        """Converts an input to a tensor of its own, like a belief's."""
+        return _like(belief, "input", input, self._names.input_names)
+
+    def _as_measurement(self, belief: Gaussian, measured: Any) -> Tensor:
+        """Converts a measurement to a tensor of its own, like a belief's.
+
+        Raises:
+            ShapeError: It has another number of entries.
+        """
+        y = _like(belief, "a measurement", measured, self._measured_names)
+        expected = (*belief.mean.shape[:-1], self.measurement.output_dim)
+        if y.shape != expected:
+            raise ShapeError(
+                f"a measurement must have shape {expected}; got {tuple(y.shape)}"
+            )
+        return y
+
     def _view(self, belief: Gaussian) -> "_View":
         """Computes what sensors show of a belief (*batch, n), without their noise."""
         root = covariance_root(belief.covariance)
         if getattr(self.observer, "first_order", False):
-            nothing = checked_arguments(self.measurement, belief, None)
-            value, H, _ = predict_with_jacobian(self.measurement, belief.mean, nothing)
-            seen = H @ root
+            no_input = checked_arguments(self.measurement, belief, None)
+            value, H, _ = predict_with_jacobian(self.measurement, belief.mean, no_input)
+            H_root = H @ root
             return _View(
                 root=root,
-                seen=seen,
+                H_root=H_root,
                 mean=value.mean,
-                covariance=squared(seen) + value.covariance,
+                covariance=squared(H_root) + value.covariance,
                 linearization_error=value.covariance,
             )
         propagated = self.observer.propagate(self.measurement, belief)
         covariance = propagated.belief.covariance
-        seen = seen_through(root, propagated.cross_covariance)
+        H_root = whitened_cross_covariance(root, propagated.cross_covariance)
         return _View(
             root=root,
-            seen=seen,
+            H_root=H_root,
             mean=propagated.belief.mean,
             covariance=covariance,
-            linearization_error=unexplained(covariance, seen),
+            linearization_error=unexplained_covariance(covariance, H_root),
         )
 
     def run(self, belief: Gaussian, inputs: Any, measured: Any) -> FilterRun:
@@ -406,7 +416,7 @@ class _View(NamedTuple):
     """A belief N(mu, L L') as sensors show it."""
 
     root: Tensor  # L (*batch, n, n)
-    seen: Tensor  # Y of Cov[x, y] = L Y' (*batch, p, n)
+    H_root: Tensor  # Y = H L of Cov[x, y] = L Y' (*batch, p, n)
     mean: Tensor  # E[y] (*batch, p)
     covariance: Tensor  # Cov[y] (*batch, p, p)
     linearization_error: Tensor  # Cov[y] - Y Y' (*batch, p, p)
@@ -430,9 +440,9 @@ def smooth(run: FilterRun) -> Gaussian:
         # The state a step later is a measurement of this one; what the log says of it
         # comes instead of what was predicted, whose noise is the process noise.
         root = covariance_root(run.filtered.covariance[k])
-        seen = seen_through(root, run.cross_covariances[k])
-        noise = unexplained(run.predicted.covariance[k + 1], seen)
-        given_next = condition(root, seen, noise)
+        H_root = whitened_cross_covariance(root, run.cross_covariances[k])
+        noise = unexplained_covariance(run.predicted.covariance[k + 1], H_root)
+        given_next = condition(root, H_root, noise)
         difference = mean - run.predicted.mean[k + 1]
         mean = run.filtered.mean[k] + given_next.gain @ difference
         carried = given_next.gain @ covariance_root(covariance)
@@ -462,17 +472,24 @@ class LateMeasurements:
 
     def __init__(self, filter: KalmanFilter, belief: Gaussian, longest: int = 10):
         check_number("longest", longest, least=0, whole=True)
+        check_kind("filter", filter, KalmanFilter, "KalmanFilter(...)")
+        check_kind("belief", belief, Gaussian, "a Gaussian")
+        # A copy: a belief of an array shares its memory.
+        belief = replace(
+            belief, mean=belief.mean.clone(), covariance=belief.covariance.clone()
+        )
         self.filter = filter
         self.belief = belief
         # Beliefs before the measurements of each step.
         self._before: deque[Gaussian] = deque([belief], longest + 1)
-        self._inputs: deque[Any] = deque(maxlen=longest)
-        self._measured: deque[list[Any]] = deque([[]], longest + 1)
+        self._inputs: deque[Tensor] = deque(maxlen=longest)
+        self._measured: deque[list[Tensor]] = deque([[]], longest + 1)
 
     def step(self, input: Any) -> Gaussian:
         """Goes on by a step with an applied input (m,); returns the belief after it."""
-        self._inputs.append(input)
-        self.belief = self.filter.predict(self.belief, input)
+        acting = self.filter._as_input(self.belief, input)
+        self.belief = self.filter.predict(self.belief, acting)
+        self._inputs.append(acting)
         self._before.append(self.belief)
         self._measured.append([])
         return self.belief
@@ -480,11 +497,14 @@ class LateMeasurements:
     def measure(self, measured: Any, age: int = 0) -> Gaussian:
         """Takes a measurement (p,) of the state ``age`` steps ago.
 
+        Where it raises, nothing has changed.
+
         Returns:
             The belief over the state now.
 
         Raises:
             SettingError: It is older than the filter remembers, or from the future.
+            ShapeError: It has another number of entries.
         """
         check_number("age", age, least=0, whole=True, unit="[steps]")
         if age >= len(self._before):
@@ -493,14 +513,35 @@ class LateMeasurements:
                 f"must be at most {len(self._before) - 1} steps, which are remembered; "
                 f"got {age}",
             )
-        self._measured[-1 - age].append(measured)
-        for k in range(-1 - age, 0):
-            if k > -1 - age:
-                self._before[k] = self.filter.predict(self.belief, self._inputs[k])
-            self.belief = self._before[k]
-            for y in self._measured[k]:
-                self.belief = self.filter.update(self.belief, y).belief
+        y = self.filter._as_measurement(self.belief, measured)
+        before = list(self._before)[-1 - age :]
+        measurements = list(self._measured)[-1 - age :]
+        measurements[0] = [*measurements[0], y]
+        belief = before[0]
+        for k in range(age + 1):
+            if k > 0:
+                belief = self.filter.predict(belief, self._inputs[k - 1 - age])
+                before[k] = belief
+            for of_sensor in measurements[k]:
+                belief = self.filter.update(belief, of_sensor).belief
+        for k in range(age + 1):
+            self._before[k - 1 - age] = before[k]
+            self._measured[k - 1 - age] = measurements[k]
+        self.belief = belief
         return self.belief
+
+
+def _check_same_type(model: DynamicsModel, measurement: Measurement) -> None:
+    """Raises ``SettingError`` where the two compute in another type or place."""
+    ours = (model.dtype, model.device)
+    theirs = (measurement.dtype, measurement.device)
+    if ours != theirs:
+        raise SettingError(
+            "measurement",
+            f"must be {ours[0]} on {ours[1]} like the model, as its noise_covariance "
+            f"is; got {theirs[0]} on {theirs[1]} (model.to(...), or "
+            "dataclasses.replace(measurement, noise_covariance=...))",
+        )
 
 
 def _measured_names(
@@ -514,10 +555,11 @@ def _measured_names(
 
 
 def _like(belief: Gaussian, key: str, value: Any, names: Sequence[str]) -> Tensor:
-    """Converts numbers to a tensor like a belief's, in the order of names."""
-    if not isinstance(value, Tensor) or value.is_complex():
-        value = np.array(read_array(key, value, names))
-    return torch.as_tensor(value, dtype=belief.mean.dtype, device=belief.mean.device)
+    """Copies numbers to a tensor like a belief's, in the order of names."""
+    if isinstance(value, Tensor) and not value.is_complex():
+        return value.to(belief.mean, copy=True)
+    array = np.array(read_array(key, value, names))
+    return torch.as_tensor(array, dtype=belief.mean.dtype, device=belief.mean.device)
 
 
 def _stacked(beliefs: Sequence[Gaussian]) -> Gaussian:

@@ -34,6 +34,7 @@ errors and by a factor of 100.
 """
 
 import math
+from collections import defaultdict
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -43,7 +44,7 @@ from torch import Tensor
 
 from gpmpc._angles import angles_of, state_difference
 from gpmpc._calls import explains_arguments
-from gpmpc._dynamics import DynamicsModel
+from gpmpc._dynamics import DynamicsModel, to_array
 from gpmpc.exceptions import DataError, ShapeError, UnsupportedModel, check_number
 from gpmpc.gp import (
     GPPosterior,
@@ -65,6 +66,9 @@ ITERATIONS = 15
 CHI2_LOG_MEAN = -1.2703628454614782  # of log chi^2_1
 CHI2_LOG_VARIANCE = math.pi**2 / 2
 _FEWEST_ROWS = 10  # that a noise is estimated from
+# difference of two targets at one state and input, in deviations of the noise, up to
+# which they may be of one row
+_SAME_TARGET = 0.1
 _LARGEST_RESPONSE = 10.0  # change of a working response by one residual, at most
 
 
@@ -85,7 +89,8 @@ class ProcessNoise:
     def long_run_variance(self) -> Tensor:
         """Variance of the white noise whose sum over many steps varies as much (k,).
 
-        sigma^2 (1 + rho) / (1 - rho).
+        sigma^2 (1 + rho) / (1 - rho), of rho between 0 and 0.99: a negative or unknown
+        correlation counts as none, and a larger one as 0.99.
         """
         rho = self.correlation.nan_to_num(0.0).clamp(0.0, 0.99)
         return self.variance * (1 + rho) / (1 - rho)
@@ -218,59 +223,113 @@ def residuals(model: Any, transitions: Transitions, block: int) -> Residuals:
     u = transitions.inputs.to(dtype=model.dtype, device=model.device)
     after = transitions.next_states.to(dtype=model.dtype, device=model.device)
     belief = model.predict(x, u)
-    errors = state_difference(after, belief.mean, angles_of(model))
-    variance = belief.variance.clone()
+    in_sample = Residuals(
+        errors=state_difference(after, belief.mean, angles_of(model)),
+        latent=belief.variance,
+    )
     trained = _trained_gp(model, x, u)
-    if trained is not None and trained.gp.has_observation_noise:
-        _leave_out_blocks(trained, block, errors, variance)
-    return Residuals(errors=errors, latent=variance)
+    if trained is None:
+        return in_sample
+    return _leave_out_blocks(trained, block, in_sample)
 
 
 def _leave_out_blocks(
-    trained: "_TrainedGP", block: int, errors: Tensor, variance: Tensor
-) -> None:
-    """Overwrites errors and variances (N, k) of rows that the GPs were trained on."""
+    trained: "_TrainedGP", block: int, in_sample: Residuals
+) -> Residuals:
+    """Returns residuals as if rows that the GPs were trained on had been left out.
+
+    Args:
+        trained: The GPs.
+        block: Rows that are left out together.
+        in_sample: Residuals of all rows by the GPs with all their points.
+    """
     gp = trained.gp
-    row_of_point = {tuple(point): i for i, point in enumerate(gp.features.tolist())}
-    pairs = [
-        (row, row_of_point[tuple(point)])
-        for row, point in enumerate(trained.features.tolist())
-        if tuple(point) in row_of_point
-    ]
-    if not pairs:
-        return
-    for rows_and_points in torch.tensor(pairs, dtype=torch.long).split(block):
-        rows, points = rows_and_points.unbind(1)
-        missed = errors.new_zeros(len(rows), gp.output_dim)
-        unknown = torch.zeros_like(missed)
+    errors = in_sample.errors.clone()
+    latent = in_sample.latent.clone()
+    pairs = _rows_and_points(trained, errors)
+    for rows, points in (part.unbind(1) for part in pairs.split(block)):
+        own_errors = trained.errors_of_points[points]
+        left_out_errors = torch.zeros_like(own_errors)
+        latent_variances = torch.zeros_like(own_errors)
         for a in range(gp.output_dim):
             covariance = torch.linalg.inv(gp.precision[a][points][:, points])
-            missed[:, a] = covariance @ gp.weights[a, points]
-            latent = covariance.diagonal() - gp.noise_variance[a]
-            unknown[:, a] = latent.clamp_min(0)
-        errors[rows] = missed @ trained.effect.mT
-        variance[rows] = unknown @ trained.effect.square().mT
+            left_out_errors[:, a] = covariance @ gp.weights[a, points]
+            variances = covariance.diagonal() - trained.noise[a]
+            latent_variances[:, a] = variances.clamp_min(0)
+        # What no output of the GPs can change is left as it is.
+        errors[rows] += (left_out_errors - own_errors) @ trained.effect.mT
+        latent[rows] = latent_variances @ trained.effect.square().mT
+    return Residuals(errors=errors, latent=latent)
+
+
+def _rows_and_points(trained: "_TrainedGP", errors: Tensor) -> Tensor:
+    """Finds the rows that the GPs were trained on, and the point that each became.
+
+    Several rows may have equal states and inputs, as those of a plant at rest: each is
+    a point of its own, the one with its target. (In units of the noise: a target that
+    differs by less than ``_SAME_TARGET`` says the same.)
+
+    Args:
+        trained: The GPs.
+        errors: Of the rows, by the GPs with all their points (N, n).
+
+    Returns:
+        Indices of rows and points (pairs, 2), in the order of the rows.
+    """
+    gp = trained.gp
+    effect = trained.effect
+    inverse = torch.linalg.pinv(effect)
+    deviations = trained.noise.sqrt()
+    of_rows = to_array(errors @ inverse.mT / deviations)
+    of_points = to_array(trained.errors_of_points @ effect.mT @ inverse.mT / deviations)
+    points_at = defaultdict(list)
+    for point, features in enumerate(gp.features.tolist()):
+        points_at[tuple(features)].append(point)
+    pairs = []
+    for row, features in enumerate(trained.features.tolist()):
+        candidates = points_at[tuple(features)]
+        if not candidates:
+            continue
+        distances = np.abs(of_points[candidates] - of_rows[row]).max(axis=1)
+        nearest = int(distances.argmin())
+        if distances[nearest] <= _SAME_TARGET:
+            pairs.append((row, candidates.pop(nearest)))
+    device = errors.device
+    return torch.tensor(pairs, dtype=torch.long, device=device).reshape(-1, 2)
 
 
 class _TrainedGP(NamedTuple):
-    """The GPs of a model, and how they act."""
+    """The GPs of a model that observed rows have trained, and how they act."""
 
     gp: GPPosterior
+    noise: Tensor  #: variances of the targets (k,)
     features: Tensor  #: what they see of states and inputs (N, d)
     effect: Tensor  #: B, by which they act on the states (n, k)
 
+    @property
+    def errors_of_points(self) -> Tensor:
+        """Errors of the targets by the GPs with all their points (points, k)."""
+        return (self.noise[:, None] * self.gp.weights).mT
+
 
 def _trained_gp(model: Any, states: Tensor, inputs: Tensor) -> _TrainedGP | None:
-    """Finds the GPs of a model; None where there are none, or B is a function."""
+    """Finds the GPs of a model.
+
+    None where there are none, they hold pseudo-observations, or B is a function.
+    """
     if isinstance(model, GPPosterior):
-        effect = torch.eye(model.output_dim, dtype=model.dtype, device=model.device)
-        return _TrainedGP(model, torch.cat([states, inputs], dim=1), effect)
-    if not isinstance(model, ResidualModel) or callable(model.B):
+        gp = model
+        effect = torch.eye(gp.output_dim, dtype=gp.dtype, device=gp.device)
+        features = torch.cat([states, inputs], dim=1)
+    elif isinstance(model, ResidualModel) and not callable(model.B):
+        gp = model.residual
+        effect = model.B
+        features = torch.cat(model.features(states, inputs), dim=1)
+    else:
         return None
-    if not isinstance(model.residual, GPPosterior):
+    if not isinstance(gp, GPPosterior) or gp.observation_noise is None:
         return None
-    features = torch.cat(model.features(states, inputs), dim=1)
-    return _TrainedGP(model.residual, features, model.B)
+    return _TrainedGP(gp, gp.observation_noise, features, effect)
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,9 @@ class SeparatedNoise:
         ``separate_noise``, which returns it.
     """
 
-    model: DynamicsModel  #: the same predictions, with the noise of the process alone
+    #: the same predictions, with the noise of the process alone: ``noise_variance`` of
+    #: its GPs is that, ``GPPosterior.observation_noise`` still all that was learned
+    model: DynamicsModel
     process: Tensor  #: variances of what moves the state in a step (n,)
     #: variances of the sensors (n,); zero where none can be told from zero
     measurement: Tensor
@@ -74,10 +76,14 @@ def separate_noise(
             "the noise of GPs, or of a ResidualModel with a constant B, can be "
             f"separated; got {type(model).__name__}"
         )
-    if not gp.has_observation_noise:
+    noise = gp.observation_noise
+    if noise is None:
         raise UnsupportedModel(
             "the noise of GPs of observed rows can be separated, not of sparse ones"
         )
+    # All that was learned, also where it was separated before.
+    gp_with_all = replace(gp, noise_variance=noise)
+    model = gp_with_all if gp is model else replace(model, residual=gp_with_all)
     errors = to_array(residuals(model, transitions, block).errors)
     successive = follows_previous(model, transitions)
     later = 1 + np.flatnonzero(successive.cpu().numpy())
@@ -91,14 +97,18 @@ def separate_noise(
     learned = np.diagonal(to_array(model.noise_covariance))
     correlated = _shared_errors(errors[later - 1], errors[later], A[later])
     scatter = (errors**2).mean(axis=0)
-    # As a part of what was learned: errors of rows that were trained on are smaller.
-    part = np.divide(correlated, scatter, out=np.zeros_like(scatter), where=scatter > 0)
-    measurement = part.clip(0.0, 1.0) * learned
-    passed_on = (A[later] ** 2).mean(axis=0) @ measurement
-    process = np.maximum(learned - measurement - passed_on, _FLOOR * learned)
+    # Scaled to the learned noise: left-out errors need not scatter as much as it says.
+    measurement_fraction = np.divide(
+        correlated, scatter, out=np.zeros_like(scatter), where=scatter > 0
+    )
+    measurement = measurement_fraction.clip(0.0, 1.0) * learned
+    sensor_noise_through_A = (A[later] ** 2).mean(axis=0) @ measurement
+    process = np.maximum(
+        learned - measurement - sensor_noise_through_A, _FLOOR * learned
+    )
     process_variance = torch.from_numpy(process)
     return SeparatedNoise(
-        model=_with_noise(model, gp, process_variance),
+        model=_with_noise(model, process_variance),
         process=process_variance,
         measurement=torch.from_numpy(measurement),
     )
@@ -122,14 +132,27 @@ def _shared_errors(before: Array, after: Array, A: Array) -> Array:
     return np.where(shared > 2.0 * deviation, shared, 0.0)
 
 
-def _with_noise(model: Any, gp: GPPosterior, process: Tensor) -> Any:
-    """Replaces the noise (n,) of a model; its means and latent variances stay."""
-    if gp is model:
-        return replace(gp, noise_variance=process.to(gp.noise_variance))
+def _with_noise(model: GPPosterior | ResidualModel, process: Tensor) -> Any:
+    """Replaces the noise (n,) of a model; its means and latent variances stay.
+
+    Args:
+        model: With all the noise that was learned.
+        process: Variances of what moves the states (n,).
+    """
+    if isinstance(model, GPPosterior):
+        return replace(model, noise_variance=process.to(model.noise_variance))
+    gp: Any = model.residual
+    smallest = torch.finfo(gp.dtype).tiny
+    if model.noise is not None:
+        learned = model.noise.diagonal().clamp_min(smallest)
+        root = (process.to(learned) / learned).sqrt()
+        return replace(model, noise=root[:, None] * model.noise * root)
     B = torch.as_tensor(model.B).to(gp.noise_variance)
-    learned = (B.square() @ gp.noise_variance).clamp_min(torch.finfo(B.dtype).tiny)
-    # Of each output the largest part that a state it acts on has left.
+    learned = (B.square() @ gp.noise_variance).clamp_min(smallest)
+    # Of each output the largest part that a state it acts on has left; all of one that
+    # acts on none.
     left = process.to(learned) / learned
-    parts = torch.stack([left[B[:, a] != 0].max() for a in range(gp.output_dim)])
+    left_by_output = torch.where(B != 0, left[:, None], 0.0).amax(dim=0)
+    parts = torch.where((B != 0).any(dim=0), left_by_output, 1.0)
     quieter = replace(gp, noise_variance=parts * gp.noise_variance)
     return replace(model, residual=quieter)

@@ -78,11 +78,22 @@ class BatchExactGP(gpytorch.models.ExactGP):
 def to_gpytorch(posterior: GPPosterior) -> BatchExactGP:
     """Builds the GPyTorch model of a posterior.
 
-    Its prior mean is a constant that training leaves alone.
+    Its prior mean is a constant that training leaves alone. Its noise is that of the
+    targets, ``GPPosterior.observation_noise``.
+
+    Raises:
+        UnsupportedModel: The posterior holds a sparse model's pseudo-observations,
+            whose noise no likelihood of GPyTorch has.
 
     See Also:
         ``from_gpytorch``, the way back.
     """
+    noise = posterior.observation_noise
+    if noise is None:
+        raise UnsupportedModel(
+            "the posterior holds a sparse model's pseudo-observations, no data: "
+            "to_gpytorch takes posteriors of observed rows"
+        )
     model = BatchExactGP(posterior.features, posterior.targets)
     model.signals = posterior.signals
     mean = gpytorch.means.ConstantMean(batch_shape=posterior.offset.shape)
@@ -90,7 +101,7 @@ def to_gpytorch(posterior: GPPosterior) -> BatchExactGP:
     model.mean_module.constant.copy_(posterior.offset)
     log_lengthscales = posterior.lengthscales.log()
     log_signal = posterior.signal_variance.log() / 2
-    log_noise = posterior.noise_variance.log() / 2
+    log_noise = noise.log() / 2
     theta = torch.column_stack([log_lengthscales, log_signal, log_signal - log_noise])
     model.set_hyperparameters(theta)
     return model.eval()

@@ -91,7 +91,7 @@ def append_points(
         targets: (p, k).
 
     Raises:
-        ShapeError: The points have other dimensions.
+        ShapeError: The points have other dimensions, or there is none.
         SettingError: The larger kernel matrix is not positive definite in this dtype.
         DataError: An entry is not finite.
 
@@ -106,16 +106,19 @@ def append_points(
     cross = kernel_matrix(posterior.features, features, lengthscales, signal_variance)
     corner = kernel_matrix(features, features, lengthscales, signal_variance)
 
-    # One pass over the factor serves the new rows and the first half of the weights.
+    # One pass over the factor serves the new rows and the weights.
     old_residuals = (posterior.targets - posterior.offset).mT[..., None]  # (k, N, 1)
     columns = torch.cat([cross, old_residuals], dim=-1)
     whitened = torch.linalg.solve_triangular(posterior.cholesky, columns, upper=False)
     L21 = whitened[..., :p].mT
-    half_old = whitened[..., p:]
+    whitened_old = whitened[..., p:]  # L^-1 (y - offset)
     corner = corner - L21 @ L21.mT
-    corner.diagonal(dim1=-2, dim2=-1).add_(posterior.noise_variance[:, None])
+    noise = posterior.observation_noise
+    if noise is None:  # new rows are observations, also beside pseudo-observations
+        noise = posterior.noise_variance
+    corner.diagonal(dim1=-2, dim2=-1).add_(noise[:, None])
     L22, info = torch.linalg.cholesky_ex(corner)
-    check_positive_definite(info, signal_variance, posterior.noise_variance)
+    check_positive_definite(info, signal_variance, noise)
     cholesky = posterior.cholesky.new_empty(posterior.output_dim, size + p, size + p)
     cholesky[:, :size, :size] = posterior.cholesky
     cholesky[:, :size, size:] = 0
@@ -123,11 +126,13 @@ def append_points(
     cholesky[:, size:, size:] = L22
 
     new_residuals = (targets - posterior.offset).mT[..., None]
-    half_new = torch.linalg.solve_triangular(
-        L22, new_residuals - L21 @ half_old, upper=False
+    whitened_new = torch.linalg.solve_triangular(
+        L22, new_residuals - L21 @ whitened_old, upper=False
     )
-    half = torch.cat([half_old, half_new], dim=-2)
-    weights = torch.linalg.solve_triangular(cholesky.mT, half, upper=True)[..., 0]
+    whitened_residuals = torch.cat([whitened_old, whitened_new], dim=-2)
+    weights = torch.linalg.solve_triangular(
+        cholesky.mT, whitened_residuals, upper=True
+    )[..., 0]
     return replace(
         posterior,
         features=torch.cat([posterior.features, features]),
@@ -173,6 +178,8 @@ def remove_points(
     Raises:
         SettingError: An index is out of range or stands there twice.
         DataError: No point is left.
+        torch.linalg.LinAlgError: So many are removed that the rest is factorised anew,
+            and it is not positive definite in this dtype.
 
     See Also:
         ``append_points``; ``SlidingWindow``.
@@ -197,8 +204,10 @@ def remove_points(
         cholesky = _refactorize(posterior.cholesky, remaining, first=removed[0])
     targets = posterior.targets[remaining]
     residuals = (targets - posterior.offset).mT[..., None]
-    half = torch.linalg.solve_triangular(cholesky, residuals, upper=False)
-    weights = torch.linalg.solve_triangular(cholesky.mT, half, upper=True)[..., 0]
+    whitened_residuals = torch.linalg.solve_triangular(cholesky, residuals, upper=False)
+    weights = torch.linalg.solve_triangular(
+        cholesky.mT, whitened_residuals, upper=True
+    )[..., 0]
     return replace(
         posterior,
         features=posterior.features[remaining],
@@ -284,21 +293,27 @@ class SlidingWindow:
     ) -> GPPosterior:
         """Appends points x~ (p, n + m) with targets (p, k), and removes others."""
         larger = append_points(posterior, features, targets)
-        removable = len(posterior)
-        if len(features) > self.points:
-            _log.warning(
-                "%d new points exceed the window of %d: some are removed too",
-                len(features),
-                self.points,
-            )
-            larger = remove_points(larger, range(removable))
-            removable = len(features)
-        excess = len(larger) - self.points
+        candidates = len(posterior)
+        if len(features) <= self.points:
+            return self._reduce(larger, candidates)
+        _log.warning(
+            "%d new points exceed the window of %d: some are removed too",
+            len(features),
+            self.points,
+        )
+        new_alone = remove_points(larger, range(candidates))
+        return self._reduce(new_alone, candidates=len(features))
+
+    def _reduce(self, posterior: GPPosterior, candidates: int) -> GPPosterior:
+        """Removes points that exceed ``points``, some of the first ``candidates``."""
+        excess = len(posterior) - self.points
         if excess <= 0:
-            return larger
+            return posterior
         if self.remove == "oldest":
-            return remove_points(larger, range(excess))
-        return remove_points(larger, least_informative(larger, excess, removable))
+            return remove_points(posterior, range(excess))
+        return remove_points(
+            posterior, least_informative(posterior, excess, candidates)
+        )
 
 
 def least_informative(
@@ -341,12 +356,12 @@ def _divergence(P: Tensor, beta: Tensor, noise: Tensor) -> Tensor:
 def _noise_variances(posterior: GPPosterior) -> Tensor:
     """Returns the noise variances of the targets (k, N).
 
-    They are sn2, or what the factor of pseudo-observations has on its diagonal beyond
-    the kernel.
+    They are those of observations, or what the factor of pseudo-observations has on its
+    diagonal beyond the kernel.
     """
-    nominal = posterior.noise_variance[:, None].expand_as(posterior.weights)
-    if posterior.has_observation_noise:
-        return nominal
+    noise = posterior.observation_noise
+    if noise is not None:
+        return noise[:, None].expand_as(posterior.weights)
     diagonal = posterior.cholesky.square().sum(-1) - posterior.signal_variance[:, None]
     return diagonal.clamp_min(torch.finfo(posterior.dtype).eps)
 

@@ -29,7 +29,7 @@ from gpmpc._dynamics import (
 )
 from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays
 from gpmpc.gp._backend import may_use_compiled
-from gpmpc.gp._kernel import factorize, kernel_of_squares
+from gpmpc.gp._kernel import factorize, kernel_matrix, kernel_of_squares
 from gpmpc.gp._scaling import Scaling
 from gpmpc.gp._tensor_checks import Predicts, check_gp_tensors
 from gpmpc.signals import UNKNOWN, Signals, check_signals
@@ -79,7 +79,8 @@ class GPPosterior(TensorModel):
     targets: Tensor
     lengthscales: Tensor  #: l (k, n + m), one row an output
     signal_variance: Tensor  #: sf2 (k,)
-    noise_variance: Tensor  #: sn2 (k,)
+    #: sn2 (k,), of the targets; see ``observation_noise`` for the exceptions
+    noise_variance: Tensor
     offset: Tensor  #: the prior mean, one constant an output (k,)
     cholesky: Tensor  #: lower factor L of K + sn2 I (k, N, N)
     weights: Tensor  #: beta = (K + sn2 I)^-1 (y - offset) (k, N)
@@ -246,14 +247,47 @@ class GPPosterior(TensorModel):
         return torch.eye(self.state_dim, dtype=self.dtype, device=self.device)
 
     @property
+    def observation_noise(self) -> Tensor | None:
+        """Noise variances of ``targets`` (k,); None of pseudo-observations.
+
+        They are ``noise_variance``, or what the factor holds beyond the kernel where
+        that is the same for all points: after ``gpmpc.estimation.separate_noise``
+        ``noise_variance`` is the process' part alone. Pseudo-observations, as of a
+        sparse model, have a noise of their own each, correlated with that of others.
+        """
+        diagonal = self.cholesky.square().sum(-1)
+        nominal = (self.signal_variance + self.noise_variance)[:, None]
+        if self._is_round_off(diagonal - nominal):
+            return self.noise_variance
+        noise = diagonal.mean(-1) - self.signal_variance
+        cross = kernel_matrix(
+            self.features[1:],
+            self.features[:1],
+            lengthscales=self.lengthscales,
+            signal_variance=self.signal_variance,
+        )[..., 0]
+        first_column = self.cholesky[:, 1:, 0] * self.cholesky[:, :1, 0]
+        is_kernel_and_noise = (
+            len(self) > 1
+            and bool((noise > 0).all())
+            and self._is_round_off(diagonal - diagonal[:, :1])
+            and self._is_round_off(first_column - cross)
+        )
+        return noise if is_kernel_and_noise else None
+
+    def _is_round_off(self, errors: Tensor) -> bool:
+        """Whether errors of K + sn2 I (k, N) are round-off of its diagonal."""
+        diagonal = (self.signal_variance + self.noise_variance)[:, None]
+        round_off = torch.finfo(self.dtype).eps ** 0.75 * diagonal
+        return bool((errors.abs() <= round_off).all())
+
+    @property
     def has_observation_noise(self) -> bool:
-        """Whether ``targets`` are observations with noise sn2.
+        """Whether ``targets`` are observations, with the noise ``observation_noise``.
 
         Those of a sparse model are pseudo-observations instead.
         """
-        diagonal = (self.signal_variance + self.noise_variance)[:, None]
-        error = (self.cholesky.square().sum(-1) - diagonal).abs()
-        return bool((error <= torch.finfo(self.dtype).eps ** 0.75 * diagonal).all())
+        return self.observation_noise is not None
 
     def to(
         self, device: str | torch.device | None = None, dtype: torch.dtype | None = None
@@ -277,8 +311,9 @@ class GPPosterior(TensorModel):
         )
 
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:
-        """Predicts the next state at a certain state and input.
+        """Predicts the outputs at a certain state and input.
 
+        They are the next state, or the values of GPs with ``predicts="value"``.
         Rasmussen and Williams (2006), eqs. (2.25) and (2.26).
 
         Args:

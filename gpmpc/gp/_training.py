@@ -192,7 +192,8 @@ class Trainer:
                 or is none. Further errors are those of ``fit``.
         """
         _check_posterior("posterior", posterior)
-        if not posterior.has_observation_noise:
+        noise = posterior.observation_noise
+        if noise is None:
             raise UnsupportedModel(
                 "the posterior holds a sparse model's pseudo-observations, no data: "
                 "train again with SparseTrainer"
@@ -209,7 +210,7 @@ class Trainer:
             posterior.input_dim,
             predicts=posterior.predicts,
             seed=seed,
-            start=posterior,
+            start=replace(posterior, noise_variance=noise),
         )
         return training.with_signals(posterior.signals)
 

@@ -203,3 +203,52 @@ def test_misuse_is_refused():
         AdaptiveTube(tube, 0.99, decisions=100)
     with pytest.raises(ShapeError, match=r"means must be \(6, 2\); got \(5, 2\)"):
         AdaptiveTube(tube, 0.8).remember(np.zeros((5, 2)), np.zeros((5, 2, 2)))
+    adaptive = AdaptiveTube(tube, 0.8)
+    means = np.zeros((H + 1, 2))
+    covariances = np.zeros((H + 1, 2, 2))
+    for mistake, rule in (
+        (lambda: adaptive.observe([0.0]), r"a state must be \(2,\); got \(1,\)"),
+        (lambda: adaptive.observe(np.zeros(3)), r"must be \(2,\); got \(3,\)"),
+        (lambda: adaptive.observe(np.zeros((1, 2))), r"\(2,\); got \(1, 2\)"),
+        (
+            lambda: adaptive.remember(means, covariances[1:]),
+            r"covariances must be \(6, 2, 2\); got \(5, 2, 2\)",
+        ),
+        (
+            lambda: adaptive.remember(means, covariances, [True]),
+            r"stages must be \(5,\) or \(5, 4\); got \(1,\)",
+        ),
+        (
+            lambda: AdaptiveTube(tube, 0.8, noise=[0.1, 0.1]),
+            r"noise must be \(2, 2\); got \(2,\)",
+        ),
+        (lambda: ConformalTube(np.ones(5), [[1.0]]), r"scores must be \(N, H\)"),
+        (lambda: ConformalTube(np.ones((5, 1)), [1.0]), r"rows must be \(r, n\)"),
+    ):
+        with pytest.raises(ShapeError, match=rule):
+            mistake()
+    with pytest.raises(SettingError, match="angles: must be a list of different"):
+        ConformalTube(np.ones((5, 1)), [[1.0, 0.0]], angles=[2])
+
+
+def test_what_was_handed_out_or_taken_belongs_to_each_side():
+    tubes = [
+        AdaptiveTube(
+            ConformalTube(np.arange(1.0, 20.0)[:, None], [[1.0]], angles=[0]),
+            0.8,
+            rate=0.3,
+        )
+        for _ in range(2)
+    ]
+    state = np.zeros(1)
+    history = []
+    copies = []
+    for k in range(8):
+        state[:] = k % 3
+        history.append(tubes[0].observe(state))
+        copies.append(tubes[1].observe(state.copy()).copy())
+        for tube in tubes:
+            tube.remember(np.zeros((2, 1)), 0.01 * np.ones((2, 1, 1)))
+    assert len({float(kappas[0]) for kappas in copies}) > 2
+    assert np.array_equal(history, copies)
+    assert np.array_equal(tubes[0].counts, tubes[1].counts)

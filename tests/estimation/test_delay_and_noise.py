@@ -76,6 +76,15 @@ def test_a_delay_is_found_for_any_zero_of_states_and_inputs(offset):
     assert scaled.steps == estimate_delay(states, inputs).steps
 
 
+def test_no_delay_is_tried_that_is_longer_than_the_longest():
+    states, inputs = log(60, 0, 1)
+    delays = estimate_delay(states, inputs, longest=2, resolution=0.3).delays
+    assert delays.tolist() == [0.0, 0.3, 0.6, 0.9, 1.2, 1.5, 1.8]
+    delays = estimate_delay(states, inputs, longest=3, resolution=0.1).delays
+    assert len(delays) == 31
+    assert delays[-1] == 3.0
+
+
 def test_states_that_rest_or_repeat_others_change_no_delay():
     states, inputs = log(300, 3, 0)
     uninformative = [np.full(301, 2.0), states[:, 0], states @ [1.0, -3.0]]
@@ -198,6 +207,97 @@ def test_rows_that_were_trained_on_count_as_if_they_had_not_been():
     assert (estimate_process_noise(model, data).variance > in_sample).all()
 
 
+def at_rest_then_pushed(noise):
+    """A plant that rests for the half of its log; its sensor shows nothing then."""
+    rng = np.random.default_rng(5)
+    inputs = np.zeros((60, 1))
+    inputs[20:50] = rng.uniform(-1, 1, (30, 1))
+    states = np.zeros((61, 2))
+    for k in range(20, 50):
+        pushed = pendulum(states[k], inputs[k])
+        states[k + 1] = pushed + 0.02 * rng.normal(size=2)
+    states[50:] = 0
+    after = states[1:] + noise * rng.normal(size=(60, 2))
+    return Transitions(states[:-1], inputs, after)
+
+
+def without_rows(gp, rows):
+    keep = [i for i in range(len(gp)) if i not in rows]
+    return GPPosterior.from_hyperparameters(
+        gp.features[keep],
+        gp.targets[keep],
+        lengthscales=gp.lengthscales,
+        signal_variance=gp.signal_variance,
+        noise_variance=gp.noise_variance,
+        input_dim=gp.input_dim,
+        predicts=gp.predicts,
+        offset=gp.offset,
+    )
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01], ids=["equal rows", "equal (x, u)"])
+@pytest.mark.parametrize("order", ["of time", "of a training in another order"])
+def test_each_row_of_a_plant_at_rest_is_left_out_itself(noise, order):
+    data = at_rest_then_pushed(noise)
+    trained = data
+    if order != "of time":
+        trained = data[np.random.default_rng(0).permutation(60).tolist()]
+    model = GPPosterior.from_hyperparameters(
+        trained.features,
+        trained.targets("difference"),
+        lengthscales=torch.full((2, 3), 0.8, dtype=torch.float64),
+        signal_variance=torch.tensor([0.01, 0.1], dtype=torch.float64),
+        noise_variance=torch.tensor([1e-4, 1e-4], dtype=torch.float64),
+        input_dim=1,
+        predicts="difference",
+    )
+    in_time = without_rows(model, ())
+    if order != "of time":
+        in_time = GPPosterior.from_hyperparameters(
+            data.features,
+            data.targets("difference"),
+            lengthscales=model.lengthscales,
+            signal_variance=model.signal_variance,
+            noise_variance=model.noise_variance,
+            input_dim=1,
+            predicts="difference",
+        )
+    squares = []
+    for first in range(0, 60, 20):
+        block = data[first : first + 20]
+        belief = without_rows(in_time, range(first, first + 20)).predict(
+            block.states, block.inputs
+        )
+        squares.append((block.next_states - belief.mean).square() - belief.variance)
+    expected = torch.cat(squares).mean(0)
+    variance = estimate_process_noise(model, data).variance
+    assert (expected > 0).all()
+    assert torch.allclose(variance, expected, rtol=1e-6)
+
+
+def test_a_row_with_the_state_and_input_of_a_point_but_another_target_is_new():
+    data = transitions(*log(40, 0, 3, std=(2e-3, 0.03)))
+    gp = Trainer(predicts="difference", restarts=0)(data).posterior
+    again = Transitions(data.states, data.inputs, data.next_states + 1.0)
+    belief = gp.predict(data.states, data.inputs)
+    squares = (again.next_states - belief.mean).square() - belief.variance
+    variance = estimate_process_noise(gp, again).variance
+    assert torch.allclose(variance, squares.mean(0), rtol=1e-6)
+
+
+def test_the_part_of_an_error_that_no_residual_reaches_stays():
+    data = transitions(*log(80, 0, 2, std=(0.02, 0.03)))
+    trained = ResidualModel.train(
+        Affine.identity(2, 1),
+        data,
+        B=torch.tensor([[0.0], [1.0]], dtype=torch.float64),
+        trainer=Trainer(restarts=0),
+    )
+    noise = estimate_process_noise(trained, data)
+    untouched = (data.next_states - data.states)[:, 0].square().mean()
+    assert float(noise.variance[0]) == pytest.approx(float(untouched), rel=1e-9)
+
+
 def test_with_process_noise_widens_tubes_and_keeps_the_data():
     data = transitions(*log(80, 0, 1))
     model = Trainer(predicts="difference", restarts=0)(data).posterior
@@ -250,5 +350,12 @@ def test_misuse_is_refused():
         estimate_delay(states, inputs[:50])
     with pytest.raises(DataError, match="a delay of up to 60 steps needs"):
         estimate_delay(states, inputs, longest=60)
+    for settings, rule in (
+        ({"confidence": 1.0}, "confidence: must lie between 0 and 1; got 1.0"),
+        ({"resamples": 0}, "resamples: must be a whole number, 1 or more; got 0"),
+        ({"seed": -1}, "seed: must be a whole number, 0 or more; got -1"),
+    ):
+        with pytest.raises(SettingError, match=rule):
+            estimate_delay(states, inputs, longest=3, **settings)
     with pytest.raises(DataError, match="must be finite"):
         estimate_delay(np.where(states > 1, np.nan, states) * np.nan, inputs)

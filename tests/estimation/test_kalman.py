@@ -1,6 +1,7 @@
 """Filters and the smoother, against conditioning of the joint Gaussian, and their
 consistency on a pendulum."""
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -156,6 +157,38 @@ def test_a_late_measurement_counts_as_if_it_had_come_in_time():
         SettingError, match="age: must be at most 4 steps, which are remembered; got 5"
     ):
         late.measure(measured[0], age=5)
+
+
+def test_a_late_filter_keeps_its_own_numbers_and_survives_mistakes():
+    sensor = Measurement.of_states(2, [0], [0.1])
+    filter = KalmanFilter.extended(LINEAR, sensor)
+    _, inputs, measured = simulated(LINEAR, 8, 1, sensor)
+    start = PRIOR.mean.numpy().copy()
+    expected = LateMeasurements(filter, Gaussian.certain(start.copy()))
+    reused = LateMeasurements(filter, Gaussian.certain(start))
+    start[:] = 7.0
+    # Buffers of a loop, which it goes on to use.
+    input = np.zeros(1)
+    y = torch.zeros(1, dtype=F)
+    for k in range(8):
+        expected.step(inputs[k])
+        expected.measure(measured[k + 1])
+        input[:] = inputs[k].numpy()
+        y.copy_(measured[k + 1])
+        reused.step(input)
+        reused.measure(y)
+        with pytest.raises(ShapeError):
+            reused.measure([1.0, 2.0, 3.0], age=min(k, 3))
+        with pytest.raises(DataError):
+            reused.measure("high")
+        with pytest.raises(ShapeError):
+            reused.step([1.0, 2.0])
+        with pytest.raises(DataError):
+            reused.step([np.nan])
+    expected.measure([0.3], age=5)
+    reused.measure([0.3], age=5)
+    assert torch.equal(reused.belief.mean, expected.belief.mean)
+    assert torch.equal(reused.belief.covariance, expected.belief.covariance)
 
 
 @pytest.mark.parametrize("kind", [KalmanFilter.extended, KalmanFilter.unscented])
@@ -440,9 +473,55 @@ def test_errors_of_the_wrong_size_are_inconsistent():
     assert normalized_errors(errors, P).degrees.sum() == 596
 
 
+def test_white_innovations_of_correlated_sensors_are_white():
+    S = np.array([[1.0, 0.95, 0.0], [0.95, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    S[2, :2] = S[:2, 2] = 0.4
+    S[2, 2] = 2.0
+    L = np.linalg.cholesky(S)
+    beyond = 0
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        innovations = rng.normal(size=(120, 3)) @ L.T
+        innovations[rng.random((120, 3)) < 0.1] = np.nan
+        value, limit = autocorrelation(innovations, np.tile(S, (120, 1, 1)))
+        beyond += abs(value) > limit
+    assert beyond <= 11  # 5 are expected; by deviations alone 13 are
+    # Two perfect sensors of one state say what one says.
+    e = np.random.default_rng(0).normal(size=(50, 1))
+    alone = autocorrelation(e, np.ones((50, 1, 1)))
+    assert autocorrelation(np.hstack([e, e]), np.ones((50, 2, 2))) == alone
+
+
 @pytest.mark.parametrize(
     ("make", "error", "rule"),
     [
+        (
+            lambda m: normalized_errors(np.ones((3, 2)), np.ones((3, 2, 2))),
+            DataError,
+            "must be positive definite; got a singular one",
+        ),
+        (
+            lambda m: autocorrelation(np.ones((5, 2)), np.ones((5, 2, 2)), lag=0),
+            SettingError,
+            "lag: must be a whole number, 1 or more; got 0",
+        ),
+        (
+            lambda m: autocorrelation(np.ones((5, 2)), np.ones((5, 2))),
+            ShapeError,
+            r"need covariances \(T, p, p\); got \(5, 2\) and \(5, 2\)",
+        ),
+        (
+            lambda m: KalmanFilter(
+                LINEAR, replace(m, noise_covariance=m.noise_covariance.float())
+            ),
+            SettingError,
+            "measurement: must be torch.float64 on cpu like the model",
+        ),
+        (
+            lambda m: LateMeasurements(LINEAR, PRIOR),
+            SettingError,
+            r"filter: must be KalmanFilter\(...\); got Known",
+        ),
         (
             lambda m: KalmanFilter(LINEAR, Measurement.of_states(3, [0], [0.1])),
             SettingError,

@@ -1,6 +1,7 @@
 """Noise of the process and of the sensors, told apart on motions whose noise is
 known."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -8,9 +9,22 @@ import pytest
 import torch
 
 from gpmpc.calibration import Recording, calibrate
-from gpmpc.estimation import separate_noise
+from gpmpc.estimation import (
+    estimate_process_noise,
+    separate_noise,
+    with_process_noise,
+)
 from gpmpc.exceptions import DataError, UnsupportedModel
-from gpmpc.gp import GPPosterior, SparseTrainer, Transitions, train
+from gpmpc.gp import (
+    GPPosterior,
+    SparseTrainer,
+    Trainer,
+    Transitions,
+    append_transitions,
+    from_gpytorch,
+    to_gpytorch,
+    train,
+)
 from gpmpc.models import Affine, KnownModel, ResidualModel
 from gpmpc.propagation import Linearization
 
@@ -80,6 +94,45 @@ def test_the_model_predicts_the_same_with_process_noise():
         assert bool((noise < 0.7 * model.noise_covariance.diagonal()).all())
 
 
+def test_after_the_separation_all_that_was_learned_is_still_known():
+    sensors = np.array([0.01, 0.02])
+    gp, rows = learned(0.3 * sensors, sensors, steps=120)
+    separated = separate_noise(gp, rows).model
+    assert torch.allclose(separated.observation_noise, gp.noise_variance, rtol=1e-9)
+    # Further measured rows are as noisy as those before.
+    further = append_transitions(gp, rows[:5])
+    apart = append_transitions(separated, rows[:5])
+    assert torch.allclose(apart.weights, further.weights, rtol=1e-9)
+    assert torch.equal(apart.noise_variance, separated.noise_variance)
+    noise = estimate_process_noise(gp, rows).variance
+    assert torch.allclose(estimate_process_noise(separated, rows).variance, noise)
+    again = separate_noise(separated, rows)
+    assert torch.allclose(again.process, separated.noise_variance, rtol=1e-6)
+    trainer = Trainer(predicts="difference", restarts=0)
+    refitted = trainer.refit(separated).posterior.noise_variance
+    assert torch.allclose(refitted, gp.noise_variance, rtol=0.05)
+    replaced = with_process_noise(separated, gp.noise_variance)
+    assert torch.allclose(replaced.cholesky, gp.cholesky)
+    again = from_gpytorch(to_gpytorch(separated), input_dim=1, predicts="difference")
+    assert torch.allclose(again.weights, gp.weights, rtol=1e-6)
+
+
+def test_a_separated_noise_reaches_every_form_of_a_residual_model():
+    sensors = np.array([0.01, 0.02])
+    model, rows = learned(0.3 * sensors, sensors, kind="residual", steps=120)
+    usual = separate_noise(model, rows)
+    own = replace(model, noise=model.noise_covariance)
+    separation = separate_noise(own, rows)
+    assert torch.allclose(separation.process, usual.process)
+    of_model = separation.model.noise_covariance.diagonal()
+    assert torch.allclose(of_model, usual.process)
+    # An output that acts on no state keeps its noise.
+    one_alone = replace(model, B=torch.tensor([[0.0, 0.0], [0.0, 1.0]]).double())
+    noise = separate_noise(one_alone, rows).model.residual.noise_variance
+    assert float(noise[1]) < 0.7 * float(model.residual.noise_variance[1])
+    assert noise[0] == model.residual.noise_variance[0]
+
+
 def test_only_separated_noise_gives_honest_intervals():
     sensors = np.array([0.01, 0.02])
     model, rows = learned(0.1 * sensors, sensors)
@@ -104,6 +157,8 @@ def test_what_cannot_be_separated_is_refused():
     for other in (nominal, sparse):
         with pytest.raises(UnsupportedModel, match="can be separated"):
             separate_noise(other, rows)
+    with pytest.raises(UnsupportedModel, match="pseudo-observations, no data"):
+        to_gpytorch(sparse)
     assert isinstance(model, GPPosterior)
     with pytest.raises(DataError, match="needs 20 rows that follow one another; got 0"):
         separate_noise(model, rows[torch.arange(0, 60, 2)])
