@@ -1187,7 +1187,7 @@ typedef struct {
 
 /* Returns the limits of the price of elastic rows (gpmpc/mpc/_elastic.py): with cost J0
    and violations V0 of the plan without them,
-   least price = 2 (J + ..) / V0,   extra cost = (J + ..) / 20,   J0 <= J <= 2 J0 */
+   least price = 2 (J + ..) / V0,   J0 <= J <= 2 J0,   extra cost = (J0 + ..) / 10 */
 static elastic_limits limits_of_price(const gpmpc_problem *problem, const real *misses,
                                       real free_cost, real last_cost)
 {
@@ -1220,7 +1220,7 @@ static elastic_limits limits_of_price(const gpmpc_problem *problem, const real *
         }
     cost += beside;
     limits.least_price = 2 * cost / larger(sum_of_misses, REAL(1e-12));
-    limits.extra_cost = REAL(0.05) * cost;
+    limits.extra_cost = REAL(0.1) * (free_cost + beside);
     return limits;
 }
 
@@ -1248,17 +1248,22 @@ static real cost_when_followed(gpmpc_controller *controller,
     return cost_of_plan(problem, states, inputs);
 }
 
-/* Solves the program for the highest price of elastic rows whose plan is affordable: of
-   a few between the least price and the highest one, and the least where none is. */
-static void raise_elastic_price(gpmpc_controller *controller, real price, real highest,
-                                real affordable_cost)
+/* Solves the program for the highest price of elastic rows whose plan is affordable: the
+   exact one, or one of a few between the least and that; the least where none is. */
+static void raise_elastic_price(gpmpc_controller *controller, real least_price,
+                                real highest, real affordable_cost)
 {
     gpmpc_problem *problem = &controller->problem;
     gpmpc_program *program = &controller->program;
     gpmpc_solution *solution = &controller->candidate;
     gpmpc_solution *trial = &controller->elastic;
+    real price = smaller(least_price, highest);
     int is_affordable = 0;
     int i;
+    if (cost_when_followed(controller, solution) <= affordable_cost) {
+        set_elastic_price(problem, highest);
+        return;
+    }
     for (i = 0; i < 5; i++) {
         real middle = SQRT(price * highest);
         set_elastic_price(problem, middle);
@@ -1288,7 +1293,7 @@ static void solve_elastic(gpmpc_controller *controller)
     real misses[GPMPC_STATE_ROWS];
     real inputs[GPMPC_SIZE];
     real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
-    real last_cost, free_cost, affordable_cost;
+    real last_cost, affordable_cost;
     real highest = 0;
     int e;
     if (solution->status != GPMPC_SOLVED)
@@ -1308,15 +1313,15 @@ static void solve_elastic(gpmpc_controller *controller)
                              last_cost);
     if (!problem->has_feedback)
         write_gains(problem);
-    free_cost = cost_when_followed(controller, without);
-    affordable_cost = free_cost + limits.extra_cost;
-    if (!is_finite(affordable_cost))
-        affordable_cost = -INFINITY;
-    set_elastic_price(problem, highest);
-    if (cost_when_followed(controller, solution) <= affordable_cost)
+    affordable_cost = INFINITY;
+    if (controller->has_plan)
+        affordable_cost = cost_when_followed(controller, without) + limits.extra_cost;
+    if (is_finite(affordable_cost)) {
+        raise_elastic_price(controller, limits.least_price, highest, affordable_cost);
         return;
-    raise_elastic_price(controller, smaller(limits.least_price, highest), highest,
-                        affordable_cost);
+    }
+    set_elastic_price(problem, limits.least_price);
+    solve(problem, &controller->program, solution, solution);
 }
 #endif
 

@@ -17,8 +17,9 @@ violations is added. A direction that the cost does not weigh counts there as it
 largest weight does: else a bound in it would count for nothing.
 
 This is the least price. The linearised program may promise more than the vehicle can
-do; where the model itself, rolled out along the plan, pays at most J0 + SHARE J, the
-bound may be dearer: of a few prices up to the exact one the highest such is taken.
+do: as long as a plan that the model itself rolls out costs at most a SHARE of J0 more,
+the bound may be dearer. Of a few prices up to the exact one the highest such is taken;
+for a first plan, whose guess says little about costs, the least.
 """
 
 from typing import NamedTuple
@@ -32,8 +33,8 @@ Array = np.ndarray
 # With 4 instead, a car beside its lane was lost now and then; with 1 a reactor's
 # economic cost was worth more than its bound.
 WORTH = 2.0
-# Of .03 to 1 the best for a car beside its lane: with more it was lost on a poor model.
-SHARE = 0.05
+# Of .02 to 2 the best for a car beside its lane: with more it was lost on a poor model.
+SHARE = 0.1
 TRIALS = 5  # prices between the least and the exact one
 NO_PRICE = 1e-9  # of a row that does not count: it keeps its place among the others
 _TINY = 1e-12
@@ -90,10 +91,11 @@ def elastic_limits(
     weights = np.where(weights > _TINY * largest, weights, largest)
     # The cheapest move by a violation v along a gradient g has the size v / |g|.
     moving_costs = weights / np.maximum(squares, _TINY) ** 2 * missed**2
-    cost = min(max(free_cost, last_cost), 2.0 * free_cost) + moving_costs.sum()
+    moving_cost = moving_costs.sum()
+    cost = min(max(free_cost, last_cost), 2.0 * free_cost) + moving_cost
     return ElasticLimits(
         least_price=WORTH * cost / max(missed.sum(), _TINY),
-        extra_cost=SHARE * cost,
+        extra_cost=SHARE * (free_cost + moving_cost),
     )
 
 

@@ -608,15 +608,16 @@ class _ControlStep:
             elastic=elastic,
             Q=self._prediction.problem.cost.Q,
         )
-        free_cost = self._cost_when_followed(program, free_solution, local)
-        affordable_cost = free_cost + limits.extra_cost
-        if not math.isfinite(affordable_cost):
-            affordable_cost = -math.inf
-        if self._cost_when_followed(program, solution, local) <= affordable_cost:
-            return solution
-        return self._raise_elastic_price(
-            program, solution, local, limits.least_price, affordable_cost
-        )
+        if self._request.previous is not None:
+            free_cost = self._cost_when_followed(program, free_solution, local)
+            affordable_cost = free_cost + limits.extra_cost
+            if math.isfinite(affordable_cost):
+                return self._raise_elastic_price(
+                    program, solution, local, limits.least_price, affordable_cost
+                )
+        prices[elastic] = limits.least_price
+        self._row_prices = prices
+        return self._solve_priced(program, solution, prices)
 
     def _raise_elastic_price(
         self,
@@ -628,9 +629,11 @@ class _ControlStep:
     ) -> QPSolution:
         """Returns the solution under the highest price whose plan is affordable.
 
-        It is the highest of a few between the least price and the exact one, and the
-        least one where none of them is.
+        It is the exact price, or the highest of a few between the least and that, and
+        the least one where none of them is.
         """
+        if self._cost_when_followed(program, solution, local) <= affordable_cost:
+            return solution
         elastic = self._prediction.constraints.elastic
         prices = self._prediction.constraints.prices.copy()
         highest_price = float(prices[elastic].max())

@@ -15,7 +15,9 @@ from tests.mpc.small_models import LinearGaussian
 H = 12
 
 
-def planned(penalty, start, goal=0.0, upper=0.5, form="trajectory", push=50.0):
+def planned(
+    penalty, start, goal=0.0, upper=0.5, form="trajectory", push=50.0, decisions=1
+):
     """A cart's plan whose position is to stay below a bound; the push costs next to
     nothing."""
     settings = {} if penalty in ("default", "free") else {"penalty": penalty}
@@ -28,9 +30,13 @@ def planned(penalty, start, goal=0.0, upper=0.5, form="trajectory", push=50.0):
     model = LinearGaussian([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]])
     prediction = PredictionSettings(form, covariance="none")
     controller = GPMPC(model, Linearization(), problem, H, [0.0], prediction)
-    return controller.control(
-        Gaussian.certain(np.array(start)), Reference(np.array([goal, 0.0]))
-    )
+    belief = Gaussian.certain(np.array(start))
+    decision = None
+    for _ in range(decisions):
+        decision = controller.control(
+            belief, Reference(np.array([goal, 0.0])), decision
+        )
+    return decision
 
 
 @pytest.mark.parametrize("start", [[0.0, 0.0], [0.4, 0.5], [0.49, -1.0]])
@@ -63,12 +69,30 @@ def test_where_it_cannot_its_price_cannot_outweigh_the_cost(start, form):
 def test_a_bound_that_is_cheap_is_as_dear_as_an_exact_one(form):
     """Where pushes are small the cost asks for nearly the fastest return anyway."""
     free, elastic, exact = (
-        planned(p, [0.8, 1.0], form=form, push=3.0)
+        planned(p, [0.8, 1.0], form=form, push=3.0, decisions=2)
         for p in ("free", "default", "exact")
     )
     assert exact.cost < 1.04 * free.cost
     assert elastic.status is Status.SOFT_BOUND_MISSED
-    np.testing.assert_allclose(elastic.inputs, exact.inputs, atol=1e-9)
+    np.testing.assert_allclose(elastic.inputs, exact.inputs, atol=1e-6)
+
+
+def test_a_plan_that_goes_on_pays_a_tenth_for_a_dear_bound():
+    free, first, elastic, exact = (
+        planned(penalty, [0.7, 0.0], push=8.0, decisions=decisions)
+        for penalty, decisions in (
+            ("free", 1),
+            ("default", 1),
+            ("default", 2),
+            ("exact", 1),
+        )
+    )
+    assert exact.cost > 1.3 * free.cost
+    missed = np.maximum(0.0, free.means[1:, 0] - 0.5)
+    tenth = 0.1 * (free.cost + (missed**2).sum())
+    assert free.cost + 0.3 * tenth < elastic.cost <= free.cost + tenth + 1e-9
+    sums = [np.maximum(0.0, d.means[1:, 0] - 0.5).sum() for d in (first, elastic)]
+    assert sums[1] <= sums[0] + 1e-9
 
 
 def test_a_reference_beyond_a_bound_does_not_make_it_free():
