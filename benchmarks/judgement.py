@@ -209,7 +209,9 @@ def experiment(scenario: Scenario) -> Experiment:
             chosen, controller=partial(chosen.controller, horizon=scenario.horizon)
         )
     if scenario.disturbances is not None:
-        chosen = replace(chosen, disturbances=scenario.disturbances(chosen.flown))
+        chosen = replace(
+            chosen, disturbances=scenario.disturbances(chosen.plant_in_loop)
+        )
     return replace(chosen, seed=scenario.seed)
 
 

@@ -10,6 +10,7 @@ import ast
 import hashlib
 import os
 import platform
+import shlex
 import subprocess
 import sys
 import sysconfig
@@ -40,7 +41,7 @@ def provenance() -> dict:
     """Returns what a reader needs to run the same again, as plain data."""
     return {
         "created": now(),
-        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
         "git": _git_commit(),
         "code": code_fingerprint_or_none(),
         "python": platform.python_version(),

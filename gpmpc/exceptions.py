@@ -82,7 +82,7 @@ class Diverged(GpmpcError, ArithmeticError):
     """A simulated system left the finite numbers, or its episode ended."""
 
     #: the ``Rollout`` of a closed loop up to there; None where that was its first step
-    flown: Any = None
+    rollout: Any = None
 
     def __init__(self, step: int, message: str):
         super().__init__(step, message)

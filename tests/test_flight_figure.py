@@ -6,6 +6,7 @@ import pytest
 from gpmpc.exceptions import ShapeError
 from gpmpc.mpc import Timing
 from gpmpc.plotting import flight_figure
+from gpmpc.plotting._style import GREY
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
 from gpmpc.systems import System, cart_pole, pendulum
@@ -64,6 +65,27 @@ def test_signals_of_one_unit_share_a_panel_with_a_legend():
     assert figure.axes[0].get_legend().get_lines()[1].get_color() != (
         figure.axes[0].get_legend().get_lines()[0].get_color()
     )
+
+
+class Chain:
+    state_names = tuple(f"m{i}" for i in range(10))
+    input_names = ("lift",)
+
+    def derivative(self, x, u):
+        return [-value for value in x]
+
+
+def test_each_of_many_lines_of_one_unit_has_its_name_and_look():
+    system = System(Chain(), 0.1, units=dict.fromkeys(Chain.state_names, "rad"))
+    axis, *_ = flight_figure(rollout(10, 1), system).axes
+    legend = axis.get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == [*Chain.state_names]
+    states = [line for line in axis.lines if not line.get_label().startswith("ref")]
+    assert [line.get_ydata()[-1] for line in states] == [*range(1, 11)]
+    looks = [(line.get_color(), line.get_linestyle()) for line in legend.get_lines()]
+    assert looks == [(line.get_color(), line.get_linestyle()) for line in states]
+    assert len({*looks}) == 10
+    assert GREY not in {colour for colour, _ in looks}
 
 
 def test_an_input_holds_until_its_step_ends_between_its_bounds():

@@ -97,6 +97,7 @@ def _fly_job(job: Job) -> None:
         config=job.settings.config(),
         options=job.settings.options,
         choices=job.choices,
+        command=job.settings.command(job.choices),
         folder=job.folder,
     )
     with report_compilation():

@@ -25,7 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from gpmpc.cli._overrides import Override, read_override
 from gpmpc.cli._plain_settings import ASIDE, chosen_options, model_fingerprint
-from gpmpc.cli._settings import without_hydra
+from gpmpc.cli._settings import run_command, search_options, without_hydra
 
 # Such as ${hydra:job.name}, which differs from run to run.
 _OF_HYDRA = re.compile(r"\$\{\s*hydra\s*[:.]")
@@ -46,6 +46,8 @@ class Template:
     fingerprint: str | None
     #: whether the model is that of a file
     reads_model: bool
+    #: by which a command finds the files; see ``search_options``
+    search_options: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,10 @@ class ComposedSettings:
     def options(self) -> Mapping[str, Any]:
         """The chosen option by group."""
         return self.template.options
+
+    def command(self, choices: Sequence[str]) -> str:
+        """Returns the command that flies the run of these choices."""
+        return run_command(self.template.search_options, choices)
 
     def fingerprint(self) -> str | None:
         """Returns a text that differs where a result may.
@@ -189,6 +195,7 @@ class Composer:
             options=options,
             fingerprint=_fingerprint(config, options),
             reads_model="path" in (config.get("model") or {}),
+            search_options=search_options(composed.hydra),
         )
 
 

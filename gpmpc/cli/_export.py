@@ -99,7 +99,7 @@ def _controller_of(run: Run, experiment: Experiment) -> GPMPC:
         rule = "an exported controller does not learn; fly without"
         got = type(experiment.learning).__name__
         raise SettingError("learning", f"{rule}; got {got}")
-    model: Any = experiment.flown
+    model: Any = experiment.plant_in_loop
     if experiment.learns:
         model = experiment.model
         if model is None:

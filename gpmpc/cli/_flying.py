@@ -166,7 +166,8 @@ class Flying:
             if job.folder.state is not RunState.RUNNING
         ]
         if end.cause not in _OF_THE_WHOLE_CHUNK:
-            # Where it began none, it died on its way to the first one: all count.
+            # Only runs begun since the launch count; if none had begun, the process
+            # died while starting, and all of the chunk count.
             lost_jobs = [*filter(self._begun_now, lost_jobs)] or lost_jobs
         for job in lost_jobs:
             self._lose(job, end)

@@ -20,13 +20,30 @@ def folder_of(folder: Any) -> Path:
 
 @contextmanager
 def writing(folder: Path, key: str = "folder") -> Iterator[None]:
-    """Turns errors of writing to ``folder`` into one of the setting that named it."""
+    """Turns errors of writing to ``folder`` into one of the setting that named it.
+
+    Errors of other files, such as of data that cannot be read, are raised as they are.
+    """
     try:
         yield
     except OSError as error:
+        if not _concerns(error, folder):
+            raise
         raise SettingError(
             key, f"cannot write to {folder}: {error.strerror or error}"
         ) from error
+
+
+def _concerns(error: OSError, folder: Path) -> bool:
+    """Whether an error is of a folder, of what is in it, or of one that it is in.
+
+    One that names no file, such as of a full disk, counts as well.
+    """
+    if not isinstance(error.filename, str | bytes | os.PathLike):
+        return True
+    file = Path(os.path.abspath(os.fsdecode(error.filename)))
+    absolute = Path(os.path.abspath(folder))
+    return file.is_relative_to(absolute) or absolute.is_relative_to(file)
 
 
 def write_files(

@@ -186,18 +186,32 @@ class Joblib:
 
     def call(self, function: Work, argument: Any) -> None:
         """Calls it in a process that flies chunks later."""
-        if not self._idle:
-            self._idle.append(_new_executor())
-        with children_ignore_interrupts():
-            future = self._idle[-1].submit(function, argument)
+        future, executor = self._submit(function, argument)
+        self._idle.append(executor)  # already now: after a Ctrl-C it is closed as well
         try:
             future.result()
         except BrokenExecutor as error:
-            self._idle.pop().shutdown(wait=False, kill_workers=True)
+            self._idle.remove(executor)
+            executor.shutdown(wait=False, kill_workers=True)
             raise GpmpcError(
                 "a process that tried the settings died: by a crash, for want of "
                 "memory, or by hand"
             ) from error
+
+    def _submit(
+        self, work: Work, argument: Any
+    ) -> tuple[Future[Any], ProcessPoolExecutor]:
+        """Hands work to a process that waits for more, or to a new one."""
+        while self._idle:
+            executor = self._idle.pop()
+            try:
+                with children_ignore_interrupts():
+                    return executor.submit(work, argument), executor
+            except BrokenExecutor:  # its process died while it waited
+                executor.shutdown(wait=False, kill_workers=True)
+        executor = _new_executor()
+        with children_ignore_interrupts():
+            return executor.submit(work, argument), executor
 
     def running(self, paths: Set[str]) -> Sequence[Chunk]:
         return ()
@@ -208,10 +222,9 @@ class Joblib:
         try:
             while waiting or flying:
                 while waiting and len(flying) < self.workers:
-                    executor = self._idle.pop() if self._idle else _new_executor()
                     chunk = waiting.pop()
-                    with children_ignore_interrupts():
-                        flying[executor.submit(work, chunk)] = chunk, executor
+                    future, executor = self._submit(work, chunk)
+                    flying[future] = chunk, executor
                 for future in wait(flying, return_when=FIRST_COMPLETED).done:
                     chunk, executor = flying.pop(future)
                     error = future.exception()

@@ -16,12 +16,11 @@ from gpmpc.cli._folders import writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.recording import Run, layout, read_run, recover
-from gpmpc.recording._schema import LEVELS
+from gpmpc.recording._schema import COMPLETE, LEVELS
 from gpmpc.studies._document import Document, Table, plain_text, terminal
 
 CUT = "unfinished or damaged; this is what could be read"
-_ENDINGS = {
-    "recover": (".mcap",),
+_ENDINGS = {  # of files whose kind the ending chooses
     "export": (".csv", ".parquet"),
     "layout": (".json",),
     "inspect": (".html",),
@@ -62,8 +61,8 @@ def _output(action: str, file: Path, chosen: Path | None) -> Path:
     """Returns where an action writes, by default beside the recording."""
     if chosen is None:
         return file.parent / f"{file.stem}{_SUFFIXES[action]}"
-    endings = _ENDINGS[action]
-    if action != "recover" and chosen.suffix not in endings:
+    endings = _ENDINGS.get(action)
+    if endings is not None and chosen.suffix not in endings:
         raise SettingError(
             "output", f"must end in {' or '.join(endings)}; got {chosen.name!r}"
         )
@@ -182,6 +181,9 @@ def _facts(run: Run) -> dict[str, str]:
             for status in dict.fromkeys(run.statuses)
         )
         facts["not applied"] = str(int(run.failed.sum()))
+        outcome = run.metadata.get("end", {}).get("outcome", COMPLETE)
+        if outcome != COMPLETE:
+            facts["ended by"] = plain_text(outcome)
         judgement = _judgement(run)
         if judgement:
             facts["judgement"] = judgement

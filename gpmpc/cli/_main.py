@@ -145,6 +145,8 @@ def _goes_on_where_it_stopped(
     name: str, command: Subcommand | None, words: Sequence[str]
 ) -> bool:
     """Whether a command that was interrupted takes up its work when it is repeated."""
+    if name == "learn":
+        return True
     if command is None or not command.has_settings:
         return False
     is_sweep = "-m" in words or "--multirun" in words

@@ -10,6 +10,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from gpmpc.exceptions import SettingError
+
 #: settings that a result does not depend on
 ASIDE = ("launcher", "retries", "chunk", "folder", "live", "tracker")
 _GROUPS = (
@@ -36,13 +38,30 @@ def plain_settings(config: DictConfig, options: Mapping[str, Any]) -> dict[str, 
     Args:
         config: The settings.
         options: The chosen option by group, which is kept under ``options``.
+
+    Raises:
+        SettingError: The file of the model cannot be read here.
     """
     settings = plain_data(config)
     path = settings["model"].get("path")
     if path:
-        settings["model"]["sha256"] = model_fingerprint(path)
+        settings["model"]["sha256"] = _fingerprint_of_setting(path)
     settings = {key: value for key, value in settings.items() if key not in ASIDE}
     return settings | {"options": chosen_options(options)}
+
+
+def _fingerprint_of_setting(path: str) -> str:
+    """Returns the fingerprint of the model's file that ``model.path`` names.
+
+    Raises:
+        SettingError: It cannot be read here.
+    """
+    try:
+        return model_fingerprint(path)
+    except OSError as error:
+        raise SettingError(
+            "model.path", f"cannot read {path}: {error.strerror or error}"
+        ) from error
 
 
 def model_fingerprint(path: str) -> str:

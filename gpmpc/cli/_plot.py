@@ -12,9 +12,10 @@ from rich.console import Console
 from gpmpc.cli._commands import Result
 from gpmpc.cli._folders import writing
 from gpmpc.cli._log import condition
+from gpmpc.cli._mistakes import one_line
 from gpmpc.cli._recorded import experiment_of_run, recordings
 from gpmpc.cli._terminal import print_error
-from gpmpc.exceptions import DataError, RecordingError
+from gpmpc.exceptions import GpmpcError
 from gpmpc.plotting import (
     animate,
     film,
@@ -39,8 +40,8 @@ def plot(arguments: argparse.Namespace) -> Result:
             folder = arguments.to / path.parent.relative_to(arguments.run)
         try:
             plotted.append(_plot(arguments, path, folder))
-        except (DataError, RecordingError) as error:
-            print_error(str(error))
+        except (GpmpcError, OSError) as error:  # the others are drawn all the same
+            print_error(one_line(error))
             code = 2
     return Result({"runs": plotted}, code)
 
@@ -48,17 +49,15 @@ def plot(arguments: argparse.Namespace) -> Result:
 def _plot(arguments: argparse.Namespace, path: Path, folder: Path) -> dict[str, Any]:
     """Draws one flight; returns where it is drawn."""
     run = read_run(path)
-    if not len(run.times):
-        raise DataError(f"{path}: holds no step")
     animation = _animation(arguments, run)
     written = []
     with writing(folder, "to"), Console().status("drawing"):
-        folder.mkdir(parents=True, exist_ok=True)
         figures = {
             "tracking": tracking_figure(run),
             "inputs": inputs_figure(run),
             "timing": timing_figure(run),
         }
+        folder.mkdir(parents=True, exist_ok=True)
         for name, figure in figures.items():
             file = f"{name}.{arguments.format}"
             figure.savefig(folder / file, dpi=150)
@@ -75,7 +74,9 @@ def _plot(arguments: argparse.Namespace, path: Path, folder: Path) -> dict[str, 
 def _animation(arguments: argparse.Namespace, run: Run) -> Callable[..., None] | None:
     """Returns what animates a flight; None where it is not asked for or cannot be."""
     if arguments.film:
-        return partial(film, system=experiment_of_run(run, arguments.trust).flown)
+        return partial(
+            film, system=experiment_of_run(run, arguments.trust).plant_in_loop
+        )
     has_position = {"x", "y", "z"} <= run.pose.keys()
     if arguments.no_animation or not has_position:
         return None

@@ -3,11 +3,10 @@
 ``gpmpc run -m`` flies many of them; see ``_sweep``.
 """
 
-import shlex
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,16 +25,18 @@ from gpmpc.cli._mistakes import one_line
 from gpmpc.cli._mlflow import log_to_mlflow
 from gpmpc.cli._overrides import choices
 from gpmpc.cli._plain_settings import plain_settings
+from gpmpc.cli._settings import run_command, search_options
 from gpmpc.cli._terminal import print_error, remarks_to
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.recording import McapRecorder, RecordedSystem
+from gpmpc.simulation import Step
 from gpmpc.studies._document import terminal
 from gpmpc.studies._run_folder import (
     RECORDING,
     RunFolder,
     folder_name,
     of_other_code,
-    record,
+    run_header,
 )
 from gpmpc.studies._run_record import warning_of
 from gpmpc.studies.flight import Experiment, metrics, run_trial, summary
@@ -62,6 +63,8 @@ class RunSettings:
     options: Mapping[str, Any]
     #: what distinguishes it from other runs of the tree, ``key=value`` each
     choices: Sequence[str]
+    #: that flies it
+    command: str
     folder: RunFolder
 
 
@@ -92,13 +95,15 @@ def run(config: DictConfig) -> Result:
         # What a user can get wrong is found before anything is written.
         experiment_of(config)
         words = choices(HydraConfig.get().overrides.task)
-        settings = RunSettings(
+        hydra_settings = HydraConfig.get()
+        to_fly = RunSettings(
             config=config,
-            options=HydraConfig.get().runtime.choices,
+            options=hydra_settings.runtime.choices,
             choices=words,
+            command=run_command(search_options(hydra_settings), words),
             folder=RunFolder(folder_of(config.folder) / folder_name(words)),
         )
-        outcome = run_one(settings, warn=_warning_printer())
+        outcome = run_one(to_fly, warn=_warning_printer())
     if outcome.result is None:
         return _report_failure(outcome)
     return _report_result(outcome, outcome.result, console)
@@ -152,11 +157,16 @@ def _warning_printer() -> Warn:
     return warn
 
 
-def run_one(run: RunSettings, wait: bool = True, warn: Warn | None = None) -> Outcome:
+def run_one(
+    to_fly: RunSettings, wait: bool = True, warn: Warn | None = None
+) -> Outcome:
     """Flies one run unless its folder is finished; an error is kept in the folder.
 
+    One with a live view flies again; its folder is not finished from then on until it
+    is again.
+
     Args:
-        run: What is flown.
+        to_fly: The run.
         wait: Whether to wait for another process that works on the folder.
         warn: Called before the flight with each line of what may go wrong in it.
 
@@ -164,29 +174,29 @@ def run_one(run: RunSettings, wait: bool = True, warn: Warn | None = None) -> Ou
         Busy: Another process works on the folder, and ``wait`` is false.
         SettingError: The folder holds a run of other settings, or cannot be written.
     """
-    config = run.config
-    folder = run.folder
+    config = to_fly.config
+    folder = to_fly.folder
+    settings = plain_settings(config, to_fly.options)
     with writing(folder.path), folder.locked(wait):
-        settings = plain_settings(config, run.options)
-        if folder.finished and not config.live:
-            return Outcome(folder.path, folder.result(settings), skipped=True)
-        command = shlex.join(["gpmpc", "run", *run.choices])
-        about = record(run.choices, settings, command)
-        remarks: list[str] = []
-        # All that are to come, too. Some are made once a process, so they are not of
-        # what equal runs share.
-        about["provenance"]["remarks"] = remarks
+        if folder.finished:
+            result = folder.result(settings)
+            if not config.live:
+                return Outcome(folder.path, result, skipped=True)
+        header = run_header(to_fly.choices, settings, to_fly.command)
+        # The list is filled while the run flies. It stands under provenance, which
+        # equal runs need not share: some remarks are made once a process.
+        remarks: list[str] = header["provenance"]["remarks"]
         try:
-            text = OmegaConf.to_yaml(config, resolve=True)
-            folder.begin(text)
+            yaml_text = OmegaConf.to_yaml(config, resolve=True)
+            folder.begin(yaml_text)
             # The same sums in the same order, whatever the launcher.
             with one_thread(), remarks_to(remarks.append):
-                result = about | _fly(run, text, command, warn)
+                result = header | _fly(to_fly, yaml_text, warn)
             folder.finish(result)
         except Exception as error:
             if _was_interrupted(error):
                 raise KeyboardInterrupt from error
-            folder.fail(error, about)
+            folder.fail(error, header)
             return Outcome(
                 folder.path,
                 error=one_line(error),
@@ -215,92 +225,74 @@ def _was_interrupted(error: BaseException | None) -> bool:
     return error is not None
 
 
-def _fly(
-    run: RunSettings, text: str, command: str, warn: Warn | None
-) -> dict[str, Any]:
+def _fly(to_fly: RunSettings, yaml_text: str, warn: Warn | None) -> dict[str, Any]:
     """Trains, flies and records; returns the metrics.
 
     Args:
-        run: What is flown.
-        text: Its settings in YAML, which is put into every recording.
-        command: That flies it.
+        to_fly: The run.
+        yaml_text: Its settings, which are put into every recording.
         warn: Called before the flight with each line of what may go wrong in it.
     """
-    experiment = experiment_of(run.config)
-    if run.config.recorder != "mcap":
+    experiment = experiment_of(to_fly.config)
+    if to_fly.config.recorder != "mcap":
         return metrics(experiment, run_trial(experiment, warn=warn))
-    with ExitStack() as recorders:
-        recording = _Recording(
-            experiment=experiment,
-            folder=run.folder.path,
-            settings=text,
-            command=command,
-            live=run.config.live,
-            recorders=recorders,
-        )
-        flown = run_trial(experiment, recording.begin, warn)
-    return metrics(experiment, flown)
+    recordings = _Recordings(experiment, to_fly, yaml_text)
+    return metrics(experiment, run_trial(experiment, recordings.open_next, warn))
 
 
-class _Recording:
+class _Recordings:
     """The recordings of a run: one file for each of its episodes, and one at the end.
 
     Args:
         experiment: What is flown.
-        folder: Of the run.
-        settings: In YAML, which is put into every recording.
-        command: That flies the run.
-        live: Whether a viewer may follow the flight.
-        recorders: Closes the recorders.
+        to_fly: Its settings.
+        yaml_text: The same as text, which is put into every recording.
     """
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        folder: Path,
-        settings: str,
-        command: str,
-        live: bool,
-        recorders: ExitStack,
-    ):
+    def __init__(self, experiment: Experiment, to_fly: RunSettings, yaml_text: str):
         self._experiment = experiment
-        self._settings = settings
-        self._command = command
-        self._live = live
-        self._recorders = recorders
+        self._yaml_text = yaml_text
+        self._command = to_fly.command
+        self._live = to_fly.config.live
         episodes = getattr(experiment.learning, "episodes", 0)
         names = [f"episode_{k}.mcap" for k in range(1, 1 + episodes)]
-        self._paths = iter([folder / name for name in (*names, RECORDING)])
+        self._paths = iter([to_fly.folder.path / name for name in (*names, RECORDING)])
 
-    def begin(self, controller: Any, training: Any) -> Callable[[Any], None]:
-        """Opens the next recording; returns what is called with every step."""
+    @contextmanager
+    def open_next(
+        self, controller: Any, training: Any
+    ) -> Iterator[Callable[[Step], None]]:
+        """Opens the next recording, which ends with its flight, and says how that did.
+
+        Yields:
+            What is called with every step.
+        """
         system = self._experiment.system
         bounds = controller.problem.inputs.by_stage(controller.horizon)
-        recorder = McapRecorder(
+        gp_size = 0 if training is None else len(training.posterior)
+        with McapRecorder(
             next(self._paths),
             RecordedSystem.of(system, [side[0] for side in bounds]),
             metadata=self._metadata(training),
-            config=self._settings,
+            config=self._yaml_text,
             live=self._live,
-        )
-        self._recorders.enter_context(recorder)
-        if recorder.address:
-            print(
-                f"live view: open {recorder.address} in Foxglove or Lichtblick",
-                file=sys.stderr,
-                flush=True,
-            )
-        gp_size = 0 if training is None else len(training.posterior)
-        began = time.monotonic()
+        ) as recorder:
+            if recorder.address:
+                print(
+                    f"live view: open {recorder.address} in Foxglove or Lichtblick",
+                    file=sys.stderr,
+                    flush=True,
+                )
+            began = time.monotonic()
 
-        def on_step(step: Any) -> None:
-            recorder.record(replace(step, gp_size=step.gp_size or gp_size))
-            if self._live:
-                # A step lasts as long as the plant's, so that a viewer can follow.
-                end_of_step = began + step.time + system.time_step
-                time.sleep(max(0.0, end_of_step - time.monotonic()))
+            def on_step(step: Step) -> None:
+                recorder.record(replace(step, gp_size=step.gp_size or gp_size))
+                if self._live:
+                    # A step lasts as long as the plant's, so that a viewer can follow.
+                    end_of_step = began + step.time + system.time_step
+                    time.sleep(max(0.0, end_of_step - time.monotonic()))
 
-        return on_step
+            yield on_step
 
     def _metadata(self, training: Any) -> dict[str, Any]:
         """Returns what a reader of the recording needs besides its steps."""

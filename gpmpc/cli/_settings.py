@@ -1,5 +1,7 @@
 """Composes the settings of commands from files and overrides, by Hydra."""
 
+import os
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +19,9 @@ from gpmpc.exceptions import SettingError
 
 # Of files of models, quoted or not.
 _MODEL_ENDINGS = (".safetensors", ".safetensors'", '.safetensors"')
+
+_OWN_FOLDER = "command-line"  # where Hydra says that it found files of --config-dir
+_COMMANDS_OF_RUNS = ("run", "tune")  # whose settings are those of `gpmpc run`
 
 
 def config_folder() -> Path:
@@ -39,7 +44,7 @@ def settings(own: str | None = None) -> Iterator[None]:
 
         class OwnFolder(SearchPathPlugin):
             def manipulate_search_path(self, search_path: Any) -> None:
-                search_path.append("command-line", f"file://{folder.absolute()}")
+                search_path.append(_OWN_FOLDER, f"file://{folder.absolute()}")
 
         Plugins.instance().register(OwnFolder)
     with hydra.initialize_config_dir(
@@ -56,6 +61,37 @@ def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:
     config = hydra.compose(name, [*overrides], return_hydra_config=True)
     HydraConfig.instance().set_config(config)
     return without_hydra(config)
+
+
+def search_options(hydra_settings: Any) -> tuple[str, ...]:
+    """Returns the options of a command by which its settings were found.
+
+    A folder below the working folder is named from there, any other in full.
+
+    Args:
+        hydra_settings: Hydra's own, of settings that were composed.
+    """
+    options: list[str] = []
+    name = hydra_settings.job.config_name
+    if name not in _COMMANDS_OF_RUNS:
+        options += ["--config-name", name]
+    for source in hydra_settings.runtime.config_sources:
+        if source.provider == _OWN_FOLDER:
+            folder = os.path.relpath(source.path)
+            if folder.startswith(os.pardir):
+                folder = source.path
+            options += ["--config-dir", folder]
+    return tuple(options)
+
+
+def run_command(options: Sequence[str], overrides: Sequence[str]) -> str:
+    """Returns the command that flies one run.
+
+    Args:
+        options: By which its settings are found, of ``search_options``.
+        overrides: What distinguishes it, ``key=value`` each.
+    """
+    return shlex.join(["gpmpc", "run", *options, *overrides])
 
 
 def model_file(override: str) -> list[str]:

@@ -69,6 +69,7 @@ def study(config: DictConfig) -> Result:
     return Result(data | {"folder": str(folder)}, 1 if failed_as_a_whole else 0)
 
 
+# ``_main`` calls the function of the command's name.
 tables = figures = quality = study
 
 

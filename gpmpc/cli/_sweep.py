@@ -14,6 +14,7 @@ looked at again at the end.
 import hashlib
 import itertools
 import json
+import shlex
 from argparse import Namespace
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -33,6 +34,7 @@ from gpmpc.cli._folders import folder_of, write_files
 from gpmpc.cli._launchers import launcher_of
 from gpmpc.cli._overrides import choices, combinations
 from gpmpc.cli._plain_settings import plain_settings
+from gpmpc.cli._settings import search_options
 from gpmpc.cli._terminal import print_error, progress_bar
 from gpmpc.exceptions import check_number
 from gpmpc.studies._index import RunIndex
@@ -262,7 +264,7 @@ class _Ends:
     """Counts the runs that have ended, with a few looks at a time.
 
     Args:
-        jobs: All runs; others may be added behind them.
+        jobs: The runs: the caller's list, which may grow.
     """
 
     def __init__(self, jobs: Sequence[Job]):
@@ -305,7 +307,7 @@ def sweep(arguments: Namespace) -> Result:
         jobs = _distinct(map(runs.job, itertools.chain([first], every_run)))
         finished_before = sum(job.folder.finished for job in jobs)
         runs.check(jobs)
-        _write_plan(runs.tree, jobs)
+        _write_plan(runs.tree, jobs, search_options(runs.config.hydra))
         try:
             with runs.progress(jobs, len(jobs)):
                 outcomes = runs.fly(jobs)
@@ -317,18 +319,21 @@ def sweep(arguments: Namespace) -> Result:
     runs.print_other_code()
     runs.print_attempts()
     runs.print_warnings()
-    for outcome in end.failed:
-        print_error(f"failed: {outcome.folder}: {outcome.error}")
+    print_failed(end.failed)
     data = {
         "folder": str(runs.tree),
         "runs": [str(job.folder.path) for job in jobs],
         "of_other_code": [str(path) for path in runs.of_other_code],
         "warnings": {str(path): text for path, text in runs.warnings.items()},
-        "failed": [
-            {"folder": outcome.folder, "error": outcome.error} for outcome in end.failed
-        ],
+        "failed": [outcome._asdict() for outcome in end.failed],
     }
     return Result(data, 1 if end.failed or end.gone else 0)
+
+
+def print_failed(outcomes: Iterable[JobOutcome]) -> None:
+    """Prints runs that failed, and why."""
+    for outcome in outcomes:
+        print_error(f"failed: {outcome.folder}: {outcome.error}")
 
 
 def _ended_early(tree: Path, error: OSError) -> Result:
@@ -353,20 +358,20 @@ class _SweepEnd(NamedTuple):
 
     total: int
     finished_before: int
-    flown: int
+    finished_now: int
     failed: list[JobOutcome]
 
     @property
     def gone(self) -> int:
         """Number of runs that ended, and whose folders are not there any more."""
-        return self.total - self.finished_before - self.flown - len(self.failed)
+        return self.total - self.finished_before - self.finished_now - len(self.failed)
 
     def line(self) -> str:
         """Returns the counts in words."""
         runs = "1 run" if self.total == 1 else f"{self.total} runs"
         text = (
-            f"{runs}: {self.flown} flown, {self.finished_before} finished before, "
-            f"{len(self.failed)} failed"
+            f"{runs}: {self.finished_now} flown, "
+            f"{self.finished_before} finished before, {len(self.failed)} failed"
         )
         if self.gone:
             text += f", {self.gone} gone"
@@ -386,18 +391,21 @@ def _end_of(
     return _SweepEnd(
         total=len(jobs),
         finished_before=finished_before,
-        flown=len(finished) - finished_before,
+        finished_now=len(finished) - finished_before,
         failed=failed,
     )
 
 
-def _write_plan(tree: Path, jobs: Sequence[Job]) -> None:
+def _write_plan(tree: Path, jobs: Sequence[Job], options: Sequence[str]) -> None:
     """Writes what was asked for, so that a report knows what is missing.
 
-    Equal sweeps write the same file.
+    Equal sweeps write the same file. ``options`` are those of the command by which its
+    settings are found.
     """
-    runs = [job.choices for job in jobs]
-    plan = json.dumps({"runs": runs}, indent=1) + "\n"
+    content: dict[str, Any] = {"runs": [job.choices for job in jobs]}
+    if options:
+        content["search_options"] = shlex.join(options)
+    plan = json.dumps(content, indent=1) + "\n"
     digest = hashlib.sha256(plan.encode()).hexdigest()
     write_files(tree, {f"{PLAN}{digest[:10]}.json": plan})
 

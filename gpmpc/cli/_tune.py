@@ -8,7 +8,6 @@ command proposes the same candidates, and those that are finished are not flown 
 """
 
 import math
-import shlex
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -24,8 +23,8 @@ from gpmpc.cli._commands import Result
 from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import write_files
 from gpmpc.cli._overrides import choices
-from gpmpc.cli._settings import without_hydra
-from gpmpc.cli._sweep import Sweep
+from gpmpc.cli._settings import run_command, search_options, without_hydra
+from gpmpc.cli._sweep import JobOutcome, Sweep, print_failed
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, check_number
 from gpmpc.metrics import tracking_cost
 from gpmpc.recording import read_run
@@ -52,6 +51,8 @@ class Tuning:
         self.base = without_hydra(runs.config)
         #: all that were flown, or are being flown
         self.jobs: list[Job] = []
+        #: flights of this call that failed, and why
+        self.failed: list[JobOutcome] = []
         _check_base(self.base)
         # The cost has the weights of this controller, whatever is searched.
         self._controller: Any = experiment_of(self.base).controller
@@ -69,7 +70,8 @@ class Tuning:
         batch = [*by_folder.values()]
         self.runs.check(batch)
         self.jobs.extend(batch)
-        self.runs.fly(batch)
+        outcomes = self.runs.fly(batch)
+        self.failed += [each for each in outcomes if each.error is not None]
         return [
             sum(_cost(job, self._controller.keywords) for job in jobs) / self.seeds
             for jobs in jobs_of_candidates
@@ -86,7 +88,12 @@ class Tuning:
 
 
 def tune(arguments: Namespace) -> Result:
-    """Searches, and writes the candidates, what mattered and how the best one flies."""
+    """Searches, and writes the candidates, what mattered and how the best one flies.
+
+    Returns:
+        The best candidate; the exit code is 1 where flights failed, whose cost is
+        infinite.
+    """
     for key in ("trials", "batch", "seeds"):
         check_number(f"--{key}", getattr(arguments, key), least=1, whole=True)
     space, fixed = _space(arguments.overrides)
@@ -101,11 +108,13 @@ def tune(arguments: Namespace) -> Result:
             candidates = search.ask(min(arguments.batch, arguments.trials - start))
             search.tell(tuning.costs(candidates))
             describe(f"flying; least cost {search.costs[search.best]:.4g}")
+    print_failed(tuning.failed)
     best = search.candidates[search.best]
     least_cost = search.costs[search.best]
     if not math.isfinite(least_cost):
         raise GpmpcError(f"tune: every flight was lost or failed; see {runs.tree}")
-    command = _command(arguments, tuning, best)
+    words = [*choices(tuning.overrides(best)), f"folder={runs.tree / 'best'}"]
+    command = run_command(search_options(runs.config.hydra), words)
     base_cost = unchanged_cost if math.isfinite(unchanged_cost) else None
     document = search.document(base_cost, command)
     files = document.files("tuning") | {"tuning.html": document.html()}
@@ -118,12 +127,13 @@ def tune(arguments: Namespace) -> Result:
         "folder": str(runs.tree),
         "best": best,
         "cost": least_cost,
-        "unchanged": unchanged_cost,
+        "unchanged": base_cost,
         "of_other_code": [str(path) for path in runs.of_other_code],
+        "failed": [each._asdict() for each in tuning.failed],
         "importances": search.importances(),
         "command": command,
     }
-    return Result(data)
+    return Result(data, 1 if tuning.failed else 0)
 
 
 def _check_base(base: DictConfig) -> None:
@@ -139,18 +149,6 @@ def _check_base(base: DictConfig) -> None:
             "must be 2 or more: the cost counts from the second state on; "
             f"got {base.steps}",
         )
-
-
-def _command(arguments: Namespace, tuning: Tuning, best: Candidate) -> str:
-    """Returns the command that flies a candidate into a folder of its own."""
-    words = ["gpmpc", "run"]
-    if arguments.config_name != "tune":
-        words += ["--config-name", arguments.config_name]
-    if arguments.config_dir:
-        words += ["--config-dir", arguments.config_dir]
-    words += choices(tuning.overrides(best))
-    words.append(f"folder={tuning.runs.tree / 'best'}")
-    return shlex.join(words)
 
 
 def _space(

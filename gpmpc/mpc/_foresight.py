@@ -18,7 +18,7 @@ from gpmpc._dynamics import linearize
 from gpmpc._kernels.gp_rollout import Feedback
 from gpmpc.exceptions import SettingError
 from gpmpc.models import RollOut
-from gpmpc.mpc._controller import Decision, Reference, Timing
+from gpmpc.mpc._controller import Decision, Timing
 from gpmpc.mpc._question import Question, first_weight, hold_last
 from gpmpc.mpc._riccati import finite_horizon_lqr
 from gpmpc.mpc._stage_meter import StageMeter
@@ -331,7 +331,7 @@ class Foresight:
             turns = full_turns(flight.states - targets, angles)
             plan = controller.control(
                 whole.belief(state),
-                Reference(targets + turns, whole.reference.inputs),
+                replace(whole.reference, states=targets + turns),
                 last,
                 whole.parameters,
                 plan=(flight.inputs, flight.states),

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from gpmpc._calls import explains_arguments
-from gpmpc.exceptions import UnsupportedModel
+from gpmpc.exceptions import SettingError, UnsupportedModel
 from gpmpc.plotting._style import (
     DASHED,
     FLOWN,
@@ -50,15 +50,22 @@ def animate(run: "Run", path: str | Path) -> None:
         path: The file, .gif or .mp4 (which needs ffmpeg).
 
     Raises:
-        UnsupportedModel: The recording has no step, or no position in space.
+        SettingError: An MP4 is asked for, and there is no ffmpeg.
+        DataError: The recording has no step.
+        UnsupportedModel: The recording has no position in space.
     """
     check_run(run)
-    if not {"x", "y", "z"} <= run.pose.keys() or not len(run.times):
-        raise UnsupportedModel(
-            f"{run.path}: an animation needs steps with positions x, y and z"
-        )
+    check_file(path)
+    if not {"x", "y", "z"} <= run.pose.keys():
+        raise UnsupportedModel(f"{run.path}: an animation needs positions x, y and z")
     picture = draw_flight(run)
     save_animation(picture.figure, picture.draw, len(run.times), path)
+
+
+def check_file(path: str | Path) -> None:
+    """Raises ``SettingError`` where an MP4 is asked for, and there is no ffmpeg."""
+    if Path(path).suffix == ".mp4" and not FFMpegWriter.isAvailable():
+        raise SettingError("path", f"an MP4 needs ffmpeg, a GIF does not; got {path}")
 
 
 def save_animation(
@@ -110,7 +117,7 @@ class _Flight:
     plan_covariances: Array  # (K, H + 1, 2, 2)
     plan_stds: Array  # (K, H + 1, 2)
     is_planned: Array  # (K, H + 1) whether the plan has that stage
-    failed: Array  # (K,) whether the solve failed
+    failed: Array  # (K,) whether the plan was not applied
     distances: Array  # (K,) from the reference [cm]
     height_name: str
 
@@ -181,7 +188,7 @@ class FlightPicture:
         stages = flight.is_planned[k]
         self._tube.draw(flight.plans[k][stages], flight.plan_covariances[k][stages])
         self._width.draw(k)
-        remark = "; solve failed" if flight.failed[k] else ""
+        remark = "; plan not applied" if flight.failed[k] else ""
         self._title.set_text(
             f"{flight.times[k]:.4g} s: "
             f"{flight.distances[k]:.1f} cm from the reference{remark}"
@@ -273,7 +280,7 @@ class _WidthPanel:
 
 
 def _length_unit(largest: float) -> tuple[str, float]:
-    """Returns the unit in which a length [m] is a number of 1 or more, and a metre."""
+    """Returns the unit in which a length [m] is 1 or more, and how many are a metre."""
     for unit, scale in _LENGTHS.items():
         if scale * largest >= 1:
             return unit, scale

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, UnsupportedModel
-from gpmpc.plotting._animation import save_animation
+from gpmpc.plotting._animation import check_file, save_animation
 from gpmpc.plotting._style import FLOWN, PLAN, REFERENCE, check_run
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ Array = np.ndarray
 _WIDTH = 640
 _HEIGHT = 480
 _MOST_SHAPES = 2000  # of a scene
-_MOST_REFERENCES = 300  # drawn, at least; of more, some are left out evenly
+_FEWEST_REFERENCES = 300  # drawn of a longer path, and less than twice as many
 _TRAIL = 200  # steps of the flown path that are drawn
 _LEGEND = (("reference", REFERENCE), ("flown", FLOWN), ("plan and its tube", PLAN))
 
@@ -64,14 +64,16 @@ def film(
         enlarged: Factor of the tube's 2-sigma ellipsoids.
 
     Raises:
-        SettingError: There is no off-screen rendering here.
+        SettingError: There is no off-screen rendering here, or no ffmpeg for an MP4.
+        DataError: No step was recorded.
         UnsupportedModel: The system is none of MuJoCo whose state says where its joints
-            are, or no step was recorded.
+            are.
     """
     check_run(run)
+    check_file(path)
     dynamics = system.dynamics
     shows_joints = hasattr(dynamics, "model") and hasattr(dynamics, "positions")
-    if not len(run.times) or not shows_joints:
+    if not shows_joints:
         raise UnsupportedModel(
             f"{run.path}: a film needs steps of a MuJoCo model, "
             "and its joints' positions"
@@ -142,7 +144,7 @@ class _Scene:
         mujoco: The module, with a current context of rendering.
         run: The flight.
         dynamics: The model that flew.
-        magnification: Factor of the tube's 2-sigma ellipsoids.
+        enlarged: Factor of the tube's 2-sigma ellipsoids.
     """
 
     def __init__(
@@ -150,12 +152,12 @@ class _Scene:
         mujoco: ModuleType,
         run: "Run",
         dynamics: _JointDynamics,
-        magnification: float,
+        enlarged: float,
     ):
         self._mujoco = mujoco
         self._run = run
         self._dynamics = dynamics
-        self._magnification = magnification
+        self._enlarged = enlarged
         self._data = mujoco.MjData(dynamics.model)
         self._scene = mujoco.MjvScene(dynamics.model, _MOST_SHAPES)
         self._rendering = mujoco.MjrContext(
@@ -167,7 +169,7 @@ class _Scene:
         self.axes: list[int] = []
         if {"x", "y", "z"} <= run.pose.keys():
             self.axes = [run.pose[axis] for axis in "xyz"]
-        stride = max(1, len(run.times) // _MOST_REFERENCES)
+        stride = max(1, len(run.times) // _FEWEST_REFERENCES)
         self._reference_path = run.references[::stride][:, self.axes]
 
     def free(self) -> None:
@@ -254,7 +256,7 @@ class _Scene:
             variances, rotation = np.linalg.eigh(covariance)
             rotation[:, 0] *= np.sign(np.linalg.det(rotation))
             stds = np.sqrt(np.maximum(variances, 0))
-            half_axes = np.maximum(2 * self._magnification * stds, 1e-3)
+            half_axes = np.maximum(2 * self._enlarged * stds, 1e-3)
             self._add_shape(
                 self._mujoco.mjtGeom.mjGEOM_ELLIPSOID,
                 size=half_axes,

@@ -1,18 +1,22 @@
 """Draws a closed loop as it comes back from ``closed_loop``: one panel a unit."""
 
-from typing import TYPE_CHECKING, NamedTuple
+import itertools
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import ShapeError, check_kind
 from gpmpc.plotting._style import (
     COLOURS,
     DASHED,
+    DASHES,
     GREY,
     ORANGE,
+    figure_label,
     legend_below,
     make_figure,
     name_of,
@@ -66,10 +70,10 @@ def flight_figure(rollout: "Rollout", system: "System") -> Figure:
     check_kind("system", system, System, "a System")
     n = len(system.state_names)
     m = len(system.input_names)
-    flown = (rollout.states.shape[1], rollout.inputs.shape[1])
-    if flown != (n, m):
+    dimensions = (rollout.states.shape[1], rollout.inputs.shape[1])
+    if dimensions != (n, m):
         rule = f"{system.name} has {n} states and {m} inputs"
-        raise ShapeError(f"{rule}; the flight has {flown[0]} and {flown[1]}")
+        raise ShapeError(f"{rule}; the flight has {dimensions[0]} and {dimensions[1]}")
     state_panels = _panels(system, system.state_names)
     input_panels = _panels(system, system.input_names)
     count = len(state_panels) + len(input_panels)
@@ -77,7 +81,7 @@ def flight_figure(rollout: "Rollout", system: "System") -> Figure:
         width=7.2,
         height=1.5 * count + 0.9,
         rows=count,
-        title=f"{system.name}, {len(rollout.inputs)} steps",
+        title=f"{figure_label(system.name)}, {len(rollout.inputs)} steps",
         sharex=True,
     )
     for axis, panel in zip(axes[:, 0], state_panels, strict=False):
@@ -118,7 +122,8 @@ def _draw_states(
 ) -> None:
     """Draws states of one unit, each with its reference in its colour."""
     names = [system.state_names[index] for index in panel.indices]
-    for colour, index in zip(COLOURS * len(names), panel.indices, strict=False):
+    lines: list[Line2D] = []
+    for style, index in zip(_line_styles(len(names)), panel.indices, strict=True):
         axis.plot(
             rollout.times,
             rollout.references[:, index],
@@ -127,8 +132,8 @@ def _draw_states(
             linewidth=1,
             label="reference or bound",
         )
-        axis.plot(rollout.times, rollout.states[:, index], color=colour)
-    _name_lines(axis, names, panel, system.z_down)
+        lines += axis.plot(rollout.times, rollout.states[:, index], **style)
+    _name_lines(axis, lines, names, panel, system.z_down)
 
 
 def _draw_inputs(
@@ -136,11 +141,12 @@ def _draw_inputs(
 ) -> None:
     """Draws inputs of one unit as steps, with their finite bounds."""
     names = [system.input_names[index] for index in panel.indices]
-    for colour, index in zip(COLOURS * len(names), panel.indices, strict=False):
+    lines: list[Line2D] = []
+    for style, index in zip(_line_styles(len(names)), panel.indices, strict=True):
         values = rollout.inputs[:, index]
         # The last one holds until its step ends.
-        axis.step(
-            rollout.times, np.append(values, values[-1]), where="post", color=colour
+        lines += axis.step(
+            rollout.times, np.append(values, values[-1]), where="post", **style
         )
         for bound in (system.input_lower[index], system.input_upper[index]):
             if np.isfinite(bound):
@@ -151,15 +157,34 @@ def _draw_inputs(
                     linewidth=1,
                     label="reference or bound",
                 )
-    _name_lines(axis, names, panel, system.z_down)
+    _name_lines(axis, lines, names, panel, system.z_down)
 
 
-def _name_lines(axis: Axes, names: list[str], panel: _Panel, z_down: bool) -> None:
+def _line_styles(count: int) -> list[dict[str, Any]]:
+    """Returns colours and dashes of lines in one panel, all different up to 42.
+
+    None is grey, as references and bounds are.
+    """
+    colours = [colour for colour in COLOURS if colour != GREY]
+    styles = itertools.product(DASHES, colours)
+    return [
+        {"color": colour, "linestyle": dashes}
+        for dashes, colour in itertools.islice(itertools.cycle(styles), count)
+    ]
+
+
+def _name_lines(
+    axis: Axes, lines: list[Line2D], names: list[str], panel: _Panel, z_down: bool
+) -> None:
     """Names a panel of one line by its axis, one of several by words beside them."""
     if len(names) == 1:
         axis.set_ylabel(name_of(names[0], panel.unit, z_down))
         return
-    axis.set_ylabel(f"[{panel.unit}]")
-    drawn = [line for line in axis.lines if line.get_color() != GREY]
-    legend = axis.legend(drawn, names, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axis.set_ylabel(f"[{figure_label(panel.unit)}]")
+    legend = axis.legend(
+        lines,
+        [figure_label(name) for name in names],
+        loc="center left",
+        bbox_to_anchor=(1.0, 0.5),
+    )
     legend.set_in_layout(True)

@@ -17,6 +17,7 @@ from gpmpc.plotting._style import (
     GREY,
     ORANGE,
     VERMILION,
+    figure_label,
     legend_below,
     make_figure,
     styled,
@@ -60,7 +61,7 @@ def calibration_figure(calibration: "Calibration") -> Figure:
     )
     levels = _levels(calibration)
     for i, (coverage, density, error) in enumerate(axes.T):
-        coverage.set_title(calibration.names[i], fontsize="medium")
+        coverage.set_title(figure_label(calibration.names[i]), fontsize="medium")
         _draw_coverage(coverage, calibration, i, levels)
         coverage.tick_params(labelleft=i == 0)
         widest = levels[-1]
@@ -157,7 +158,7 @@ def innovations_figure(
     )
     for i, axis in enumerate(axes.flat):
         _draw_innovations(axis, times, normalized[:, i])
-        axis.set_ylabel(names[i])
+        axis.set_ylabel(figure_label(names[i]))
     axes[-1, 0].set_xlabel("time [s]")
     return figure
 
@@ -229,8 +230,8 @@ def _draw_errors(axis: Axes, judgement: "Judgement", group: int) -> None:
         label="model",
     )
     axis.set(
-        title=judgement.groups[group],
-        ylabel=f"mean error [{judgement.units[group]}]",
+        title=figure_label(judgement.groups[group]),
+        ylabel=f"mean error [{figure_label(judgement.units[group])}]",
     )
 
 
@@ -268,13 +269,15 @@ def inspection_figure(inspection: "Inspection") -> Figure:
         axis.plot(times, values, color=BLUE, linewidth=0.7)
         for begin, end in inspection.gaps[:_MOST_GAPS]:
             axis.axvspan(begin, end, color=ORANGE, alpha=0.4, linewidth=0)
-        axis.set_ylabel(name, rotation=0, ha="right", va="center", fontsize=7)
+        axis.set_ylabel(
+            figure_label(name), rotation=0, ha="right", va="center", fontsize=7
+        )
         axis.tick_params(labelsize=7)
     for axis in axes[-1]:
         axis.set_xlabel("row" if over_rows else "time [s]")
     for axis in axes.T.flat[len(channels) :]:
         axis.set_visible(False)
-    figure.suptitle(inspection.title, fontsize=10)
+    figure.suptitle(figure_label(inspection.title), fontsize=10)
     return figure
 
 
@@ -283,5 +286,5 @@ def _empty_page(title: str) -> Figure:
     figure, ((axis,),) = make_figure(width=10, height=2)
     axis.set_axis_off()
     axis.text(0.5, 0.5, "no channel of numbers", ha="center", va="center")
-    figure.suptitle(title, fontsize=10)
+    figure.suptitle(figure_label(title), fontsize=10)
     return figure

@@ -24,6 +24,7 @@ from gpmpc.plotting._style import (
     TUBE,
     VERMILION,
     check_run,
+    figure_label,
     legend_below,
     make_figure,
     name_of,
@@ -42,16 +43,19 @@ _LEVELS = {"suspicious": ORANGE, "lost": VERMILION}
 def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """Returns means and standard deviations (K, j) that were predicted one step before.
 
-    They are NaN where nothing was predicted. What is predicted is the state itself: the
-    noise that the plan leaves out belongs to it.
+    They are NaN where nothing was: at the first step, where the plan before was not
+    applied, and where the step before was lost. What is predicted is the state itself:
+    the noise that the plan leaves out belongs to it.
     """
     shape = (len(run.times), len(states))
     mean = np.full(shape, np.nan)
     std = np.full(shape, np.nan)
     if run.plan_means.shape[1] > 1:
         noise_std = _unplanned_noise(run)
-        mean[1:] = run.plan_means[:-1, 1, states]
-        std[1:] = np.hypot(run.plan_stds[:-1, 1, states], noise_std[states])
+        (after,) = np.nonzero((np.diff(run.steps) == 1) & ~run.failed[:-1])
+        mean[after + 1] = run.plan_means[after][:, 1, states]
+        planned_std = run.plan_stds[after][:, 1, states]
+        std[after + 1] = np.hypot(planned_std, noise_std[states])
     return mean, std
 
 
@@ -69,11 +73,17 @@ class _Tracked(NamedTuple):
 
     title: str  # its name with its unit
     unit: str
-    is_angle: bool  # its reference moves by full turns
-    flown: np.ndarray  # (K,)
+    gaps: np.ndarray  # rows before which steps are lost
+    jumps: np.ndarray  # rows at which its reference moves by a full turn
+    state: np.ndarray  # (K,) as it was flown
     reference: np.ndarray  # (K,)
     expected: np.ndarray  # (K,) mean that was predicted one step before
     expected_std: np.ndarray  # (K,)
+
+    @property
+    def breaks(self) -> np.ndarray:
+        """Rows before which a line of its reference is broken."""
+        return np.union1d(self.gaps, self.jumps)
 
 
 @explains_arguments
@@ -137,19 +147,20 @@ def _tracked_states(run: "Run") -> list[_Tracked]:
     means, stds = expected(run, indices)
     tracked_states = []
     for column, (name, index) in enumerate(zip(names, indices, strict=True)):
-        flown = run.states[:, index]
+        state = run.states[:, index]
         reference = run.references[:, index]
         mean = means[:, column]
         if name in angles:
-            reference = reference + whole_turns(flown - reference)
-            mean = mean + whole_turns(flown - mean)
+            reference = reference + whole_turns(state - reference)
+            mean = mean + whole_turns(state - mean)
         unit = units.get(f"state.{name}", "")
         tracked_states.append(
             _Tracked(
                 title=name_of(name, unit, z_is_down),
                 unit=unit,
-                is_angle=name in angles,
-                flown=flown,
+                gaps=_gaps(run),
+                jumps=_jumps(reference) if name in angles else np.empty(0, int),
+                state=state,
                 reference=reference,
                 expected=mean,
                 expected_std=stds[:, column],
@@ -160,9 +171,14 @@ def _tracked_states(run: "Run") -> list[_Tracked]:
 
 def _draw_path(axis: Axes, times: np.ndarray, state: _Tracked) -> None:
     """Draws a state over time against its reference."""
-    axis.plot(times, state.flown, color=FLOWN, linewidth=1.6, label="flown")
     axis.plot(
-        *_broken(times, state.reference, state),
+        *_broken(times, state.state, state.gaps),
+        color=FLOWN,
+        linewidth=1.6,
+        label="flown",
+    )
+    axis.plot(
+        *_broken(times, state.reference, state.breaks),
         color=REFERENCE,
         linewidth=1.2,
         linestyle=DASHED,
@@ -174,8 +190,8 @@ def _draw_path(axis: Axes, times: np.ndarray, state: _Tracked) -> None:
 def _draw_error(axis: Axes, times: np.ndarray, state: _Tracked) -> None:
     """Draws how far a state is from its reference over time."""
     axis.axhline(0, color=REFERENCE, linewidth=1, linestyle=DASHED)
-    error = state.flown - state.reference
-    axis.plot(*_broken(times, error, state), color=FLOWN, linewidth=1.2)
+    error = state.state - state.reference
+    axis.plot(*_broken(times, error, state.breaks), color=FLOWN, linewidth=1.2)
 
 
 def _draw_prediction_error(
@@ -191,17 +207,24 @@ def _draw_prediction_error(
         linewidth=0,
         label=tube,
     )
-    axis.plot(times, state.flown - state.expected, color=FLOWN, linewidth=1.0)
+    axis.plot(times, state.state - state.expected, color=FLOWN, linewidth=1.0)
+
+
+def _gaps(run: "Run") -> np.ndarray:
+    """Returns the rows before which steps are lost."""
+    return np.flatnonzero(np.diff(run.steps) != 1) + 1
+
+
+def _jumps(reference: np.ndarray) -> np.ndarray:
+    """Returns the rows at which the reference of an angle (K,) jumps by a turn."""
+    return np.flatnonzero(np.abs(np.diff(reference)) > np.pi) + 1
 
 
 def _broken(
-    times: np.ndarray, values: np.ndarray, state: _Tracked
+    times: np.ndarray, values: np.ndarray, breaks: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a line, with a gap where the reference of an angle jumps by a turn."""
-    if not state.is_angle:
-        return times, values
-    jumps = np.flatnonzero(np.abs(np.diff(state.reference)) > np.pi) + 1
-    return np.insert(times, jumps, np.nan), np.insert(values, jumps, np.nan)
+    """Returns a line that is broken before some rows."""
+    return np.insert(times, breaks, np.nan), np.insert(values, breaks, np.nan)
 
 
 def _noise_in_words(run: "Run") -> str:
@@ -227,11 +250,8 @@ def inputs_figure(run: "Run") -> Figure:
     )
     for i, (axis, name) in enumerate(zip(axes.flat, run.input_names, strict=True)):
         values = run.inputs[:, i]
-        # The last one holds until its step ends.
-        values_until_end = np.append(values, values[-1])
         axis.step(
-            _edges(run),
-            values_until_end,
+            *_until_steps_end(run, values),
             where="post",
             color=FLOWN,
             linewidth=1.4,
@@ -262,20 +282,28 @@ def timing_figure(run: "Run") -> Figure:
     totals = np.sort(milliseconds[:, -1])
     if totals.any():
         totals = totals[totals > 0]  # a controller that was not asked took no time
-    _draw_stages(over_time, _edges(run), milliseconds)
+    _draw_stages(over_time, run, milliseconds)
     _limit_height(over_time, totals)
     _draw_distribution(distribution, totals)
     legend_below(figure, [over_time])
     return figure
 
 
-def _draw_stages(axis: Axes, edges: np.ndarray, milliseconds: np.ndarray) -> None:
+def _draw_stages(axis: Axes, run: "Run", milliseconds: np.ndarray) -> None:
     """Stacks the parts (K, 4) of the decisions' times over the time."""
-    bottom = np.zeros(len(milliseconds))
+    edges, bottom = _until_steps_end(run, np.zeros(len(milliseconds)))
     stages = zip(_STAGES.items(), milliseconds.T, strict=False)
     for (name, colour), stage in stages:
-        top = bottom + stage
-        axis.stairs(top, edges, baseline=bottom, fill=True, color=colour, label=name)
+        _, values = _until_steps_end(run, stage)
+        top = bottom + values
+        axis.stairs(
+            top[:-1],
+            edges,
+            baseline=bottom[:-1],
+            fill=True,
+            color=colour,
+            label=name,
+        )
         bottom = top
     axis.set(xlabel="time [s]", ylabel="time of a decision [ms]")
 
@@ -320,10 +348,23 @@ def _draw_distribution(axis: Axes, totals: np.ndarray) -> None:
     )
 
 
-def _edges(run: "Run") -> np.ndarray:
-    """Times at which steps begin, and the end of the last one (K + 1,) [s]."""
-    width = run.times[1] - run.times[0] if len(run.times) > 1 else 1.0
-    return np.append(run.times, run.times[-1] + width)
+def _step_ends(run: "Run") -> np.ndarray:
+    """Returns the times at which steps end (K,) [s]."""
+    duration = float(np.min(np.diff(run.times), initial=np.inf))
+    return run.times + (duration if np.isfinite(duration) else 1.0)
+
+
+def _until_steps_end(run: "Run", values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns times and values (K,) that hold until their steps end.
+
+    Where steps are lost, and behind the last one, a time is added at which they do; the
+    value there is NaN before lost steps, and the last one again at the end.
+    """
+    gaps = _gaps(run)
+    ends = _step_ends(run)
+    times = np.insert(run.times, gaps, ends[gaps - 1])
+    held_values = np.insert(values, gaps, np.nan)
+    return np.append(times, ends[-1]), np.append(held_values, values[-1])
 
 
 def _duration(milliseconds: float) -> str:
@@ -337,7 +378,7 @@ def _title_of(run: "Run") -> str:
     """Returns the command that was run, or the file."""
     command = run.metadata.get("run", {}).get("command", "")
     title = command if command.startswith("gpmpc") else str(run.path)
-    return textwrap.fill(title, 90, max_lines=2, placeholder=" ...")
+    return figure_label(textwrap.fill(title, 90, max_lines=2, placeholder=" ..."))
 
 
 def _draw_bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
@@ -371,13 +412,14 @@ def _draw_bounds(axis: Axes, inputs: np.ndarray, bounds: np.ndarray) -> None:
 
 def _mark_failures(run: "Run", *axes: Axes) -> None:
     """Marks steps whose decision was not applied; shades suspicious and lost ones."""
-    edges = _edges(run).tolist()
+    begins = run.times.tolist()
+    ends = _step_ends(run).tolist()
     for axis in axes:
         for level, colour in _LEVELS.items():
-            for first, end in _spans(run.judgements == level):
+            for first, last in _spans(run.judgements == level):
                 axis.axvspan(
-                    edges[first],
-                    edges[end],
+                    begins[first],
+                    ends[last],
                     color=colour,
                     alpha=0.15,
                     linewidth=0,
@@ -396,6 +438,6 @@ def _mark_failures(run: "Run", *axes: Axes) -> None:
 
 
 def _spans(is_true: np.ndarray) -> list[tuple[int, int]]:
-    """Returns first and behind the last of every series of steps (K,) that are true."""
+    """Returns first and last of every series of steps (K,) that are true."""
     changes = np.flatnonzero(np.diff(np.concatenate([[0], is_true, [0]])))
-    return [(int(first), int(end)) for first, end in changes.reshape(-1, 2)]
+    return [(int(first), int(end) - 1) for first, end in changes.reshape(-1, 2)]

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from gpmpc._calls import explains_arguments
-from gpmpc.exceptions import check_kind
+from gpmpc.exceptions import DataError, check_kind
 
 BLUE = "#0072b2"
 VERMILION = "#d55e00"
@@ -69,9 +69,17 @@ def make_figure(
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
+def figure_label(text: str) -> str:
+    """Returns a text that somebody chose as one that is no formula in a figure."""
+    return text.replace("$", r"\$")
+
+
 def name_of(name: str, unit: str = "", z_down: bool = True) -> str:
     """Returns the name of a state or input with its unit, as ``z, downwards [m]``."""
-    full = "z, downwards" if name == "z" and z_down else _NAMES.get(name, name)
+    full = _NAMES.get(name, figure_label(name))
+    if name == "z" and z_down:
+        full = "z, downwards"
+    unit = figure_label(unit)
     return f"{full} [{unit}]" if unit not in ("", "1", "?") else full
 
 
@@ -120,7 +128,15 @@ def png(figure: Figure, dpi: int = 150) -> bytes:
 
 
 def check_run(run: object) -> None:
-    """Raises ``SettingError`` unless what is to be drawn is a recorded run."""
+    """Checks what is to be drawn.
+
+    Raises:
+        SettingError: It is no recorded run.
+        DataError: It has no step.
+    """
     from gpmpc.recording import Run  # here: a report of a sweep does not need it
 
     check_kind("run", run, Run, "a Run of read_run")
+    assert isinstance(run, Run)
+    if not len(run.times):
+        raise DataError(f"{run.path}: holds no step, there is nothing to draw")

@@ -33,29 +33,30 @@ class Series:
 @explains_arguments
 @styled
 def over_variable(
-    title: str,
-    positions: Sequence[str],
-    label: str,
+    variable: str,
+    values_of_variable: Sequence[str],
+    measure: str,
     lines: Sequence[Series],
     logarithmic: bool = False,
 ) -> Figure:
     """Draws median and quartiles of a measure over a variable, every run as a dot.
 
     Args:
-        title: Name of the variable.
-        positions: Its values, as text and in their order. Numbers stand at their place
-            on the axis, which is logarithmic where they span a decade, and medians over
+        variable: Its name, below the axis.
+        values_of_variable: As text and in their order. Numbers stand at their place on
+            the axis, which is logarithmic where they span a decade, and medians over
             them are joined; words stand side by side.
-        label: Of the measure, with its unit.
+        measure: Its name with its unit, above the axis.
         lines: What else was varied, a line each; those without a number are left out.
         logarithmic: Whether the axis is, where the values span enough for it.
     """
     line_count = sum(any(line.values) for line in lines)
     figure, ((axis,),) = make_figure(width=4.8, height=3.4 + 0.11 * line_count)
-    draw_quartiles(axis, lines, positions)
-    axis.set_title(label, fontsize="medium")
-    axis.set_xlabel(clipped(title, 50))
-    if max(map(len, positions)) * min(len(positions), _MOST_TICKS) > 40:
+    draw_quartiles(axis, lines, values_of_variable)
+    axis.set_title(measure, fontsize="medium")
+    axis.set_xlabel(clipped(variable, 50))
+    longest = max(map(len, values_of_variable))
+    if longest * min(len(values_of_variable), _MOST_TICKS) > 40:
         axis.tick_params(axis="x", labelrotation=30)
     values = [value for line in lines for group in line.values for value in group]
     low = min(values, default=0)

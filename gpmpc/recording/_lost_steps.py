@@ -32,7 +32,7 @@ def step_flaws(
     sequence = np.array([message.sequence for message in content.messages[STEP]])
     is_numbered = bool(sequence.any())  # not every program numbers its messages
     is_ordered = is_numbered and bool((np.diff(sequence) > 0).all())
-    # Where every checksum is right, another program chose the order.
+    # Without other flaws the order is a rewriting program's choice, and no damage.
     if flaws and is_numbered and not is_ordered:
         text = "its steps do not stand in the order in which they were recorded"
         return [Flaw(WRONG_ORDER, 1, text), *_count_flaws(content, len(steps), "")]
@@ -64,7 +64,11 @@ def _count_flaws(content: FileContent, present: int, where: str) -> list[Flaw]:
 def _recorded_steps(
     content: FileContent, by_index: int | None, by_end: int | None
 ) -> _Count:
-    """Chooses between the counts of index and end; the numbering counts otherwise."""
+    """Chooses between the counts of index, end and numbering.
+
+    A damaged file: the index. A whole one: the larger of index and end. Without both:
+    the largest sequence number.
+    """
     is_damaged = any(flaw.kind in DAMAGE for flaw in content.flaws)
     if is_damaged and by_index is not None:  # which has a checksum of its own
         return _Count(by_index, str(by_index))

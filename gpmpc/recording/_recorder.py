@@ -27,7 +27,11 @@ from gpmpc.exceptions import RecordingError, check_kind, check_number
 from gpmpc.recording._encoding import Encoder, StepCopy
 from gpmpc.recording._frames import LARGEST, topics_of_chunk
 from gpmpc.recording._scene import WORLD, Scene
-from gpmpc.recording._schema import CHANNELS_METADATA, CONFIG_ATTACHMENT
+from gpmpc.recording._schema import (
+    CHANNELS_METADATA,
+    COMPLETE,
+    CONFIG_ATTACHMENT,
+)
 from gpmpc.recording._sink import Sink
 from gpmpc.recording._system import RecordedSystem
 from gpmpc.step import Step
@@ -37,7 +41,8 @@ if TYPE_CHECKING:
 
 _LONGEST_WAIT = 1.0  # [s] of the clock after which the next step ends a chunk
 _SPAN = 2.0  # [s] of the flight in a chunk; a simulated one takes less than it lasts
-_LEAST = 8 * 1024  # numbers [bytes] for which a chunk is worth its own entries
+# [bytes] of numbers; fewer wait for more steps: a chunk has entries of its own
+_SMALLEST_CHUNK = 8 * 1024
 _PORT = 8765  # of the live view, if it is free
 
 
@@ -53,11 +58,15 @@ class McapRecorder:
             JSON, which is YAML).
         metadata: More to know of the run, such as its seed.
         record_problems: Keep the quadratic programs, so that they can be replayed.
-        chunk_size: Numbers [bytes] that wait in memory at most, if more than one step
-            does; what a killed run loses.
+        chunk_size: Size [bytes] of numbers that may wait in memory: with more, the
+            steps that wait are written as a chunk. They are as well when they span two
+            seconds of the flight, or have waited for one. A killed run loses what
+            waits.
         live: Serve every step to viewers as well, at ``address``.
 
     Raises:
+        SettingError: ``chunk_size`` is no whole number, 1 or more, or ``system`` of
+            another kind.
         RecordingError: The file cannot be written, or another process is writing it.
 
     See Also:
@@ -89,13 +98,13 @@ class McapRecorder:
         self._chunk_size = chunk_size
         self._encoder = Encoder(system)
         self._waiting: list[StepCopy] = []
-        self._bytes = 0  # of the steps that wait
+        self._unsaved_bytes = 0  # of numbers, in the chunk under way
         self._steps = 0
-        self._waiting_since = -math.inf  # when the chunk's first step was [s]
+        self._chunk_begins_at = -math.inf  # [s] of the flight
         self._topics: dict[int, str] = {}  # by channel, as far as they are written
         self._level = "healthy"  # of the last judgement
         self._error: str | None = None  # why no more steps are taken
-        self._last_saved = 0.0  # [s] of the clock
+        self._saved_at_clock = 0.0  # [s]
         self._closed = False
         self._server: Any = None
         self._sink = Sink(self.path)
@@ -146,16 +155,16 @@ class McapRecorder:
                 f"{self.path}: a step of {size} bytes is too large; at most "
                 f"{LARGEST // 4}"
             )
-        if self._bytes == 0:
-            self._waiting_since = step.time
+        if self._unsaved_bytes == 0:
+            self._chunk_begins_at = step.time
         self._waiting.append(copy)
-        self._bytes += size
+        self._unsaved_bytes += size
         if self._server is not None:
             self._serialise()
-        if self._is_chunk_full(step):
+        if self._is_chunk_due(step):
             self._end_chunk()
 
-    def close(self, outcome: str = "complete") -> None:
+    def close(self, outcome: str = COMPLETE) -> None:
         """Writes what waits and finishes the file; ``outcome`` is kept as metadata.
 
         Raises:
@@ -171,7 +180,7 @@ class McapRecorder:
         self._writer.close()
         self._save(sync=True)
         self._closed = True
-        self._end("the recording is closed")
+        self._stop_recording("the recording is closed")
 
     def __enter__(self) -> "McapRecorder":
         return self
@@ -186,13 +195,14 @@ class McapRecorder:
         with contextlib.suppress(RecordingError):  # most likely the same error
             self.close(f"{kind.__name__}: {error}")
 
-    def _is_chunk_full(self, step: Step) -> bool:
+    def _is_chunk_due(self, step: Step) -> bool:
         """Tells whether the steps that wait are to be written now."""
-        if self._bytes > min(self._chunk_size, LARGEST // 8):
+        if self._unsaved_bytes > min(self._chunk_size, LARGEST // 8):
             return True
-        if step.time - self._waiting_since >= _SPAN and self._bytes >= _LEAST:
+        is_long = step.time - self._chunk_begins_at >= _SPAN
+        if is_long and self._unsaved_bytes >= _SMALLEST_CHUNK:
             return True
-        return time.perf_counter() - self._last_saved > _LONGEST_WAIT
+        return time.perf_counter() - self._saved_at_clock > _LONGEST_WAIT
 
     def _end_chunk(self) -> None:
         """Writes what waits, and behind it the topics of channels that are new."""
@@ -230,12 +240,13 @@ class McapRecorder:
         try:
             self._sink.save(sync)
         except OSError as error:
-            self._end(f"the recording stopped and is unfinished: {error.strerror}")
+            reason = f"the recording stopped and is unfinished: {error.strerror}"
+            self._stop_recording(reason)
             raise RecordingError(self._error) from error
-        self._bytes = 0
-        self._last_saved = time.perf_counter()
+        self._unsaved_bytes = 0
+        self._saved_at_clock = time.perf_counter()
 
-    def _end(self, reason: str) -> None:
+    def _stop_recording(self, reason: str) -> None:
         """Takes no more steps, for a reason."""
         self._error = f"{self.path}: {reason}"
         if self._server is not None:

@@ -178,8 +178,14 @@ class _DataReader:
         """Yields the records that are whole."""
         while self._position < self._data_end and not self._ended:
             frame = read_frame(self._file, self._position, self._size)
-            if frame is None or not self._is_of_data(frame):
-                yield from self._resume_behind(frame)
+            if frame is None:
+                yield from self._seek_chunk(self._position)
+                continue
+            if not self._is_of_data(frame):
+                if self._has_right_length(frame):
+                    self._skip_record(frame)
+                else:
+                    yield from self._seek_chunk(frame.start)
                 continue
             before = self._checksum
             head = HEAD.pack(frame.kind, len(frame.content))
@@ -284,7 +290,7 @@ class _DataReader:
                 self._damage.lost_chunks.append(frame.start)
                 self._search.begin = frame.end
             else:
-                yield from self._resume_behind(None, frame.start)
+                yield from self._seek_chunk(frame.start)
             return
         if end < frame.end and not has_successor:  # its length is wrong
             self._damage.damaged_records.append(frame.start)
@@ -383,20 +389,20 @@ class _DataReader:
         is_data_kind = kind in _DATA_KINDS or kind >= _PRIVATE
         return is_data_kind and length <= self._size - position - HEAD.size
 
-    def _resume_behind(
-        self, frame: Frame | None, start: int | None = None
-    ) -> Iterator[McapRecord]:
+    def _skip_record(self, frame: Frame) -> None:
+        """Goes on behind a broken record whose length is right."""
+        self._damage.damaged_records.append(frame.start)
+        self._position = frame.end
+
+    def _seek_chunk(self, start: int) -> Iterator[McapRecord]:
         """Yields the records of the next whole chunk behind a broken record.
 
-        Reading goes on behind that chunk; or behind the broken record, if its length
-        is right; or with the next record that the index names; or it ends.
+        Reading goes on behind that chunk. Where there is none, it goes on with the next
+        record that the index names, or ends.
+
+        Args:
+            start: Where the broken record begins; where it ends is not known.
         """
-        if start is None:
-            start = self._position
-        if frame is not None and self._has_right_length(frame):
-            self._damage.damaged_records.append(start)
-            self._position = frame.end
-            return
         limit = self._data_end
         if self._index is not None and self._index.sound:
             limit = min(self._index.next_place(start + 1), limit)

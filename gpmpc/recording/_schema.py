@@ -113,6 +113,7 @@ QP = "/qp"
 TOPICS = {STEP: "Step", PLAN: "Plan", QP: "QuadraticProgram"}  # with their messages
 LEVELS = ("", "healthy", "suspicious", "lost")  # of a judgement; empty without one
 
+COMPLETE = "complete"  # outcome of a recording that no error ended
 CONFIG_ATTACHMENT = "config.yaml"
 CHANNELS_METADATA = "channels"  # topics by channel, for a run whose first chunk is lost
 RECOVERY_METADATA = "recovered"  # of a file that holds what was left of another

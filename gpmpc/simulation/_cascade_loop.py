@@ -19,7 +19,7 @@ import numpy as np
 
 from gpmpc._angles import wrap
 from gpmpc._calls import explains_arguments
-from gpmpc.exceptions import Diverged, ShapeError, check_number
+from gpmpc.exceptions import Diverged, ShapeError, check_method, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Controller, FlightJudge, Reference
 from gpmpc.mpc._policy import Command, OnFailure, decide
@@ -75,9 +75,8 @@ class Cascade:
         Yaw is to be zero. The inputs that belong to the reference are no moments.
 
         Args:
-            planned: Inputs of the outer plan (H, 3), from its current step on. Where
-                the inner horizon reaches the next outer step, it looks beyond the
-                first, and holds the last.
+            planned: Inputs of the outer plan (H, 3), from its current step on. Inner
+                stage i takes outer input (phase + i) // ratio, at most the last.
             angles: Roll, pitch and yaw now (3,) [rad].
             phase: Number of inner steps since the outer step began.
         """
@@ -130,11 +129,17 @@ def cascade_loop(
         disturbances: As for ``closed_loop``.
         on_failure: As for ``closed_loop``; of either controller.
         seed: Of all random numbers.
-        on_step: Called with the loop and its step: of the outer one as it begins, of
-            the inner one as it ends.
+        on_step: Called with the loop and its step, when the inner step has been
+            applied; at the first inner step of an outer one, first with the outer
+            step.
 
     Raises:
-        ShapeError: The plant has other states, or references are too few.
+        ShapeError: The plant has other states, references are too few, or a state or
+            noise has the wrong length.
+        DataError: References that are no numbers, or have other names.
+        SettingError: An unknown policy, noise or disturbances that do not fit, or a
+            controller without ``control``, of other names, or of another time step,
+            than its loop.
         SolverFailure: Its step is that of the controller that failed.
         Diverged: Its step is an inner one.
 
@@ -182,6 +187,7 @@ class _CascadeFlight:
         inner_signals = Signals(
             Rotational.state_names, Rotational.input_names, inner_time_step
         )
+        check_method("inner", cascade.inner, "control", "GPMPC(...)")
         check_belongs(cascade.inner, inner_signals, "the inner loop")
         self._scenario = scenario
         self._cascade = cascade
@@ -222,9 +228,9 @@ class _CascadeFlight:
         attitude = self._attitude_reference(thrust, belief, phase)
         moments = self._decide_moments(belief, attitude, inner_step)
         decided_input = np.append(thrust.input[:1], moments.input)
-        (input,) = step_together([self._simulator], time, [decided_input])
-        if isinstance(input, Diverged):
-            raise input
+        (result,) = step_together([self._simulator], time, [decided_input])
+        if isinstance(result, Diverged):
+            raise result
         if phase == 0:
             self._outer.add(
                 state=state,
@@ -237,12 +243,12 @@ class _CascadeFlight:
             state=state,
             belief=belief,
             command=moments,
-            input=input[1:],
+            input=result.input[1:],
             reference=attitude.states,
         )
         self._attitude = attitude
         self._states.append(self._simulator.mean)
-        self._inputs.append(input)
+        self._inputs.append(result.input)
 
     def _decide_thrust(
         self, belief: Gaussian, reference: Reference, step: int
@@ -313,7 +319,7 @@ def _flight_of_loop(
             controller, state_dim=len(names[0]), input_dim=len(names[1]), names=names
         ),
         on_step=None if on_step is None else partial(on_step, loop),
-        states=states,
+        own_states=states,
     )
 
 

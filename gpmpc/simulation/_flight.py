@@ -55,14 +55,16 @@ class StepSummary:
 
 
 class Flight:
-    """The loop of one controller and of those of a simulator's states that it steers.
+    """One controller's flight.
+
+    It sees the simulator's states ``own_states``: all, or in a cascade its half.
 
     Args:
         simulator: What is steered; the two loops of a cascade share one.
         time_step: Of the controller [s].
         judge: Says of every step whether the flight is healthy.
         on_step: Called with every step, outside of everything that is timed.
-        states: The controller's states among those of the simulator; all by default.
+        own_states: The controller's states among those of the simulator.
 
     Attributes:
         steps: What was flown so far.
@@ -76,17 +78,17 @@ class Flight:
         time_step: float,
         judge: FlightJudge,
         on_step: Callable[[Step], None] | None = None,
-        states: slice = slice(None),
+        own_states: slice = slice(None),
     ):
         self.steps: list[StepSummary] = []
         self.last: Command | None = None
         self.error: SolverFailure | Diverged | None = None
         self.simulator = simulator
         self.time_step = time_step
-        self._states = states
+        self._own_states = own_states
         self._on_step = on_step
         self._judge = judge
-        own = range(len(simulator.mean))[states]
+        own = range(len(simulator.mean))[own_states]
         self._angles = [i for i, j in enumerate(own) if j in simulator.angles]
 
     def add(
@@ -106,8 +108,8 @@ class Flight:
             input: What was applied in the end (m,).
             reference: The reference states from this step on (H + 1, n).
         """
-        own_state = state.part(self._states)
-        measured = belief.mean.cpu().numpy().astype(float)[self._states]
+        own_state = state.part(self._own_states)
+        measured = belief.mean.cpu().numpy().astype(float)[self._own_states]
         decision = command.decision
         learned = None if decision is None else decision.learned
         # Measured here, outside of what is timed, for the judge to see.
@@ -148,7 +150,7 @@ class Flight:
         """
         summaries = self.steps
         steps = [summary.step for summary in summaries]
-        end = self.simulator.state.part(self._states)
+        end = self.simulator.state.part(self._own_states)
         states = [step.state for step in steps]
         covariances = [step.belief_covariance for step in steps]
         references = [step.reference for step in steps]

@@ -60,9 +60,11 @@ def closed_loop(
             references.
         references: Reference states r[0] .. (steps + horizon, n) or more, one a time
             step, or a set point (n,); as a ``Reference`` with the inputs that belong to
-            them.
-        initial: The state (n,). A ``Gaussian`` is the belief that a model loop starts
-            from, and what a plant's state is drawn from.
+            them. Its ``kappas`` move along with a path, entry k + i for stage i of
+            step k; those of a set point (horizon,) hold at every step.
+        initial: The state (n,); None for a simulator, which starts an episode. A
+            ``Gaussian`` is what a plant's state is drawn from, and the belief that a
+            model loop starts from; a mean alone has the paper's deviation of 0.1 there.
         steps: K.
         noise: On a plant's states, measurements and inputs.
         disturbances: Gusts, other plants, dropouts: what the controller does not know
@@ -74,14 +76,16 @@ def closed_loop(
             as a recorder's ``record``.
 
     Raises:
-        ShapeError: Too few references for the steps and the horizon, or a state of the
-            wrong length.
-        SettingError: An unknown policy, negative noise, noise in a model loop, or a
-            controller of other names of states and inputs, or another time step, than
-            the plant has.
+        ShapeError: Too few references for the steps and the horizon, a set point's
+            kappas of another horizon, or a state or noise of the wrong length.
+        DataError: References that are no numbers, or have other names.
+        SettingError: An unknown policy, negative noise, noise in a model loop, kappas
+            that the controller cannot use, or a controller of other names of states and
+            inputs, or another time step, than the plant has.
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was
             nothing to fall back on.
-        Diverged: The system left the finite numbers; ``flown`` holds the steps before.
+        Diverged: The system left the finite numbers; ``rollout`` holds the steps
+            before.
 
     See Also:
         ``closed_loops`` for many seeds; ``gpmpc.plotting.flight_figure``, which draws
@@ -106,7 +110,7 @@ def closed_loop(
     flight = scenario.flight(seed, on_step)
     _fly_together([flight], scenario)
     if isinstance(flight.error, Diverged) and flight.steps:
-        flight.error.flown = _rollout(flight, scenario)
+        flight.error.rollout = _rollout(flight, scenario)
     if flight.error is not None:
         raise flight.error
     return _rollout(flight, scenario)
@@ -171,7 +175,9 @@ def closed_loops(
 
     Raises:
         SettingError: No seeds or equal ones; a model loop, in which a seed changes
-            nothing; or a ``chunk`` below 1.
+            nothing; a ``chunk`` below 1; and as in ``closed_loop``.
+        ShapeError: As in ``closed_loop``.
+        DataError: As in ``closed_loop``.
 
     See Also:
         ``closed_loop``, whose numbers a trial has.
@@ -249,20 +255,20 @@ def _fly_together(flights: Sequence[Flight], scenario: Scenario) -> None:
         time = round(k * scenario.system.time_step, 9)
         reference = scenario.reference_from(k)
         decided = _decide_step(flying, scenario, reference, k, time)
-        inputs = step_together(
+        results = step_together(
             [step.flight.simulator for step in decided],
             time,
             [step.command.input for step in decided],
         )
-        for step, input in zip(decided, inputs, strict=True):
-            if isinstance(input, Diverged):
-                step.flight.error = input
+        for step, result in zip(decided, results, strict=True):
+            if isinstance(result, Diverged):
+                step.flight.error = result
                 continue
             step.flight.add(
                 state=step.state,
                 belief=step.belief,
                 command=step.command,
-                input=input,
+                input=result.input,
                 reference=reference.states,
             )
 

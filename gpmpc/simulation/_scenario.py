@@ -1,7 +1,7 @@
 """Everything that a flight needs but its seed."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -32,14 +32,16 @@ class Scenario:
     """A closed loop to be run: who steers what, from where, along what.
 
     Raises:
-        ShapeError: Too few references for the steps and the horizon.
+        ShapeError: Too few references for the steps and the horizon, or a set point's
+            kappas of another horizon.
+        DataError: References that are no numbers, or have other names.
         SettingError: An unknown policy, or a controller of other names of states and
             inputs, or another time step, than the system has.
     """
 
     system: System | ModelLoop
     controller: Controller
-    references: Reference | Array | Sequence[float]
+    references: InitVar[Reference | Array | Sequence[float]]  # as the user gave them
     initial: Any  # a state (n,) or a ``Gaussian``; None for a simulator
     steps: int
     noise: Noise | None = None
@@ -48,30 +50,36 @@ class Scenario:
     name: str  # of the system, for messages
     # What the controller steers: of a cascade's outer loop less than the system.
     signals: Signals
-    #: the references of all steps and of the last horizon
-    reference: Reference = field(init=False)
+    #: the references of all steps and of the last horizon, columns in order
+    path: Reference = field(init=False)
+    #: standard deviations (H,) that replace the problem's at every step: a set point's
+    stage_kappas: Array | None = field(init=False)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, references: Reference | Array | Sequence[float]) -> None:
         check_policy(self.on_failure)
         check_method("controller", self.controller, "control", "GPMPC(...)")
         check_belongs(self.controller, self.signals, self.name)
-        reference = read_references(
-            self.references, self.steps, self.controller.horizon, self.signals
-        )
-        object.__setattr__(self, "reference", reference)
+        horizon = self.controller.horizon
+        given = read_reference(references).in_order(self.signals)
+        object.__setattr__(self, "stage_kappas", _stage_kappas(given, horizon))
+        if self.stage_kappas is not None:
+            given = replace(given, kappas=None)
+        object.__setattr__(self, "path", _path_over(given, self.steps, horizon))
 
     def reference_from(self, k: int) -> Reference:
         """Returns what the controller is to follow over its horizon from step k on."""
-        horizon = self.controller.horizon
-        states = self.reference.states[k : k + horizon + 1]
-        inputs = self.reference.inputs
+        end = k + self.controller.horizon
+        inputs = self.path.inputs
         if inputs is not None:
-            inputs = inputs[k : k + horizon]
-        return Reference(states, inputs)
+            inputs = inputs[k:end]
+        kappas = self.stage_kappas
+        if self.path.kappas is not None:
+            kappas = self.path.kappas[k:end]
+        return Reference(self.path.states[k : end + 1], inputs, kappas)
 
     def reference_state(self, k: int) -> Array:
         """Returns r[k] (n,), or the last one where no r[k] was given."""
-        states = self.reference.states
+        states = self.path.states
         return states[min(k, len(states) - 1)]
 
     def simulator(self, seed: int) -> Simulator:
@@ -129,23 +137,34 @@ def check_belongs(controller: Controller, signals: Signals, plant: str) -> None:
     signals_of(controller).check("the controller", signals, plant, "system")
 
 
-def read_references(
-    references: Reference | Array | Sequence[float],
-    steps: int,
-    horizon: int,
-    signals: Signals,
-) -> Reference:
-    """Returns references for all steps, their columns in the order of names.
+def _stage_kappas(reference: Reference, horizon: int) -> Array | None:
+    """Returns the kappas (H,) of a set point, which hold at every step.
+
+    None where there are none, and for a path, whose kappas move along with it.
 
     Raises:
-        ShapeError: They are too few, or no table.
-        DataError: They are no numbers, or have other names.
+        ShapeError: They are of another horizon.
+    """
+    if reference.kappas is None or np.ndim(reference.states) == 2:
+        return None
+    kappas = np.asarray(reference.kappas)
+    if kappas.shape != (horizon,):
+        rule = f"kappas of a set point must be ({horizon},), one a stage"
+        raise ShapeError(f"{rule}; got {kappas.shape}")
+    return kappas
+
+
+def _path_over(reference: Reference, steps: int, horizon: int) -> Reference:
+    """Returns references for all steps and for the horizon of the last one.
+
+    Raises:
+        ShapeError: They are too few.
     """
     check_number("steps", steps, least=1, whole=True)
     needed = steps + horizon
-    references = read_reference(references).in_order(signals).over(needed)
-    count = len(references.states)
+    path = reference.over(needed)
+    count = len(path.states)
     if count < needed:
         rule = f"{steps} steps with horizon {horizon} need {needed} references"
         raise ShapeError(f"{rule}; got {count}")
-    return references
+    return path

@@ -220,10 +220,11 @@ class PlantSimulator:
             )
         return self._add_noise("input", input)
 
-    def _arrive(self, state: Array, input: Array) -> Array | Diverged:
+    def _move_to(self, state: Array, input: Array) -> Diverged | None:
         """Moves to the next state (n,), with noise.
 
-        Returns the input that was applied, or why the plant cannot go on from there.
+        Returns why the plant cannot go on from there; None where it can. ``input`` is
+        what led there, for the message.
         """
         if not np.isfinite(state).all():
             before = f"it was {self.mean}, input {input}"
@@ -236,7 +237,7 @@ class PlantSimulator:
             )
         self.mean = self._add_noise("process", state)
         self._steps += 1
-        return input
+        return None
 
     def _add_noise(self, source: str, value: Array) -> Array:
         """Returns a value with the noise of a source."""
@@ -347,11 +348,8 @@ class ModelSimulator:
             return belief
         return Gaussian(belief.mean[:n], belief.covariance[:n, :n])
 
-    def step(self, input: Array) -> Array | Diverged:
-        """Carries the belief one step on.
-
-        Returns the input (m,), or why the belief cannot go on.
-        """
+    def step(self, input: Array) -> Diverged | None:
+        """Carries the belief one step on; returns why it cannot go on, if so."""
         control = torch.as_tensor(np.asarray(input, dtype=float)).to(self._belief.mean)
         belief = self.loop.propagator(self.loop.model, self._belief, control)
         mean_is_finite = torch.isfinite(belief.mean).all()
@@ -363,27 +361,33 @@ class ModelSimulator:
             )
         self._belief = belief
         self._steps += 1
-        return input
+        return None
 
 
 Simulator = PlantSimulator | ModelSimulator
 
 
+class Applied(NamedTuple):
+    """A step that a simulator has taken."""
+
+    input: Array  # (m,) that reached the plant, an actuator's noise included
+
+
 def step_together(
     simulators: Sequence[Any], time: float, inputs: Sequence[Array]
-) -> list[Array | Diverged]:
+) -> list[Applied | Diverged]:
     """Steps simulators of one plant from a time [s] on, in one evaluation.
 
     Model loops are stepped one by one.
 
     Returns:
-        The inputs (m,) that were applied, or why a simulator cannot go on.
+        What was applied to each, or why it cannot go on.
     """
     if not simulators:
         return []
     if isinstance(simulators[0], ModelSimulator):
         return [
-            simulator.step(input)
+            simulator.step(input) or Applied(input)
             for simulator, input in zip(simulators, inputs, strict=True)
         ]
     noisy_inputs = [
@@ -399,7 +403,7 @@ def step_together(
             states = np.array([simulator.mean for simulator in simulators])
             next_states = step_many(plant, states, np.array(noisy_inputs))
     return [
-        simulator._arrive(state, input)
+        simulator._move_to(state, input) or Applied(input)
         for simulator, state, input in zip(
             simulators, next_states, noisy_inputs, strict=True
         )

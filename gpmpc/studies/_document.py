@@ -5,6 +5,7 @@ LaTeX, no formula in a spreadsheet, no control sequence in a terminal.
 """
 
 import json
+import math
 import re
 from base64 import b64encode
 from collections.abc import Iterable, Mapping, Sequence, Sized
@@ -161,8 +162,22 @@ def terminal(tables: Sequence[Table], *notes: str) -> Group:
 
 
 def json_text(content: Any) -> str:
-    """Returns plain data as JSON."""
-    return json.dumps(content, indent=1) + "\n"
+    """Returns plain data as JSON, which knows no number but finite ones.
+
+    What is not finite, such as the mean of nothing, is null.
+    """
+    return json.dumps(_finite_or_null(content), indent=1, allow_nan=False) + "\n"
+
+
+def _finite_or_null(content: Any) -> Any:
+    """Returns plain data with None in the place of numbers that are not finite."""
+    if isinstance(content, float):
+        return content if math.isfinite(content) else None
+    if isinstance(content, Mapping):
+        return {key: _finite_or_null(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [_finite_or_null(value) for value in content]
+    return content
 
 
 def number(value: float) -> str:
@@ -190,11 +205,6 @@ def plain_text(text: object) -> str:
     return "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode() for c in text
     )
-
-
-def figure_label(text: str) -> str:
-    """Returns a text that is no formula in a figure."""
-    return text.replace("$", r"\$")
 
 
 def _text(cell: Any) -> str:

@@ -103,7 +103,7 @@ class Experiment:
             self.data.check(self.system, self.trajectory)
 
     @property
-    def flown(self) -> System:
+    def plant_in_loop(self) -> System:
         """The plant: the system, unless another one was given."""
         return self.plant or self.system
 
@@ -206,7 +206,7 @@ class Experiment:
         """Raises where plant, loop or learning do not fit the controller."""
         if self.loop not in ("plant", "model"):
             raise SettingError("loop", f"must be 'plant' or 'model'; got {self.loop!r}")
-        signals = self.flown.signals
+        signals = self.plant_in_loop.signals
         if self.system.signals != signals:
             raise SettingError(
                 "plant",
@@ -237,7 +237,7 @@ class Experiment:
                     f"got {disturbance!r}",
                 )
         if self.loop == "plant":
-            plant = self.flown
+            plant = self.plant_in_loop
             PlantSimulator(plant, plant.goal, self.disturbances, self.noise, self.seed)
 
     def _check_problem(self) -> None:
@@ -254,7 +254,7 @@ class Experiment:
                 f"weighs {problem.state_dim} states and {problem.input_dim} inputs; "
                 f"{self.system.name} has {n} and {m}",
             )
-        plant = self.flown
+        plant = self.plant_in_loop
         start = reference if plant.start is None else plant.start
         problem.check_start(
             np.asarray(start, dtype=float),

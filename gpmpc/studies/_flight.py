@@ -1,6 +1,7 @@
 """Flies an experiment: learns a model, makes the controller, closes the loop."""
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,7 +12,7 @@ from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import Diverged, check_kind
 from gpmpc.gp import Training
 from gpmpc.learning import EpisodicLearning, LearningController, OnlineLearning
-from gpmpc.metrics import tracking_error
+from gpmpc.metrics import _TrackingError, tracking_error
 from gpmpc.mpc import Reference
 from gpmpc.propagation import best_propagator
 from gpmpc.simulation import ModelLoop, Rollout, Step, closed_loop, rehearse
@@ -20,9 +21,12 @@ from gpmpc.studies._outlook import Outlook, outlook
 from gpmpc.studies.study import derived_seed
 from gpmpc.systems import System
 
-#: called before the first step with the controller and the training; returns what is
-#: called with every step
-Prepare = Callable[[Any, Training | None], Callable[[Step], None]]
+#: called before each flight's first step with the controller and the training. The
+#: flight flies inside of what it returns, which sees what ends it; its value is called
+#: with every step
+OpenRecording = Callable[
+    [Any, Training | None], AbstractContextManager[Callable[[Step], None]]
+]
 Warn = Callable[[str], None]
 
 
@@ -48,26 +52,29 @@ class Flown:
 @explains_arguments
 def run_trial(
     experiment: Experiment,
-    prepare: Prepare | None = None,
+    open_recording: OpenRecording | None = None,
     warn: Warn | None = None,
 ) -> Flown:
     """Trains and flies.
 
     Args:
         experiment: All of it.
-        prepare: Called before the first step with the controller and the training; what
-            it returns is called with every step.
+        open_recording: Called before each flight's first step, of episodes too, with
+            the controller and the training; returns a context manager around the
+            flight, whose value is called with every step.
         warn: Called before the first step with each line of what may go wrong in the
             flight.
 
     Raises:
         SettingError: More rows are asked for than there are, or settings that do not
             fit each other.
+        ShapeError: The data have other dimensions than the system.
         DataError: The data cannot be read.
         TrainingError: An output could not be trained.
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was
             nothing to fall back on.
         Diverged: The system left the finite numbers in its first step.
+        RecordingError: What ``open_recording`` opened could not be written.
 
     See Also:
         ``Experiment``, all that it depends on; ``metrics``, its numbers;
@@ -79,20 +86,28 @@ def run_trial(
     episodes: list[Flown] = []
     if experiment.learns and model is None:
         if isinstance(experiment.learning, EpisodicLearning):
-            episodes = _fly_episodes(experiment, experiment.learning, prepare, warn)
+            episodes = _fly_episodes(
+                experiment, experiment.learning, open_recording, warn
+            )
             best = min(episodes, key=lambda episode: rmse(experiment, episode))
             training = best.training
         else:
             training = experiment.learn(experiment.training_rows(), experiment.seed)
         model = None if training is None else training.posterior
-    flown = _fly(experiment, model=model, training=training, prepare=prepare, warn=warn)
+    flown = _fly(
+        experiment,
+        model=model,
+        training=training,
+        open_recording=open_recording,
+        warn=warn,
+    )
     return replace(flown, before=tuple(episodes))
 
 
 def _fly_episodes(
     experiment: Experiment,
     learning: EpisodicLearning,
-    prepare: Prepare | None,
+    open_recording: OpenRecording | None,
     warn: Warn | None,
 ) -> list[Flown]:
     """Flies the episodes, each with what was learned from all flights before it."""
@@ -105,7 +120,7 @@ def _fly_episodes(
             episode,
             model=training.posterior,
             training=training,
-            prepare=prepare,
+            open_recording=open_recording,
             warn=warn,
         )
         rows = learning.with_flight(rows, flown.rollout)
@@ -117,11 +132,11 @@ def _fly(
     experiment: Experiment,
     model: DynamicsModel | None,
     training: Training | None,
-    prepare: Prepare | None,
+    open_recording: OpenRecording | None,
     warn: Warn | None,
 ) -> Flown:
     """Flies with a model, or on the plant's own where the controller learns none."""
-    plant = experiment.flown
+    plant = experiment.plant_in_loop
     planner = experiment.controller(model if experiment.learns else plant)
     controller = planner
     if isinstance(experiment.learning, OnlineLearning):
@@ -134,25 +149,28 @@ def _fly(
         for warning in expected.warnings:
             warn(warning)
     rehearse(system, controller, reference, start)
-    on_step = None if prepare is None else prepare(controller, training)
+    recording = nullcontext()
+    if open_recording is not None:
+        recording = open_recording(controller, training)
     diverged = None
     try:
-        rollout = closed_loop(
-            system,
-            controller,
-            reference,
-            start,
-            experiment.steps,
-            noise=experiment.noise,
-            disturbances=experiment.disturbances,
-            on_failure=experiment.on_failure,
-            seed=experiment.seed,
-            on_step=on_step,
-        )
+        with recording as on_step:
+            rollout = closed_loop(
+                system,
+                controller,
+                reference,
+                start,
+                experiment.steps,
+                noise=experiment.noise,
+                disturbances=experiment.disturbances,
+                on_failure=experiment.on_failure,
+                seed=experiment.seed,
+                on_step=on_step,
+            )
     except Diverged as error:
-        if error.flown is None:
+        if error.rollout is None:
             raise
-        rollout = error.flown
+        rollout = error.rollout
         diverged = error
     return Flown(
         rollout=rollout,
@@ -167,7 +185,7 @@ def _steered_system(
     experiment: Experiment, model: DynamicsModel | None
 ) -> System | ModelLoop:
     """Returns the plant, or the model rolled on itself."""
-    plant = experiment.flown
+    plant = experiment.plant_in_loop
     if experiment.loop == "plant" or model is None:
         return plant
     propagator = experiment.propagator or best_propagator(model)
@@ -215,7 +233,7 @@ def errors_of(
     flown: Flown,
     places: Sequence[int],
     states: slice = slice(None),
-) -> Any:
+) -> _TrackingError:
     """Returns the tracking error of some states of a flight, but of the first row."""
     rollout = flown.rollout
     return tracking_error(

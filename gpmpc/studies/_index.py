@@ -1,7 +1,9 @@
 """Keeps what a report shows of the runs of a tree in one file, so that it reads one.
 
-    FOLDER/index.jsonl    a line a run, written when its end was seen; runs of much the
-                          same settings name a line of those, and what differs
+    FOLDER/index.jsonl    a line a run, written when its end was seen
+
+Settings are stored once as a base line; a run's line names its base and the values
+that differ.
 
 The folders stay the truth. A line counts as long as the file that it was taken from has
 the size and the time of then. What is missing, or does not count any more, whoever
@@ -184,6 +186,7 @@ class RunIndex:
             settings=Settings(base, changes),
             origin=self._shared_origin(_texts_by_name(content["origin"])),
             measures=_finite_measures(content["measures"]),
+            search_options=intern(plain_text(content.get("search_options", ""))),
             **texts,
         )
         self._lines[name] = _Line(
@@ -216,6 +219,7 @@ class RunIndex:
             settings=Settings(base, changes),
             origin=self._shared_origin(record.origin),
             measures=record.measures,
+            search_options=intern(record.search_options),
             **texts,
         )
 
@@ -227,6 +231,9 @@ class RunIndex:
 def _content(name: str, base: str, line: _Line) -> dict[str, Any]:
     """Returns a line of the file as plain data."""
     record = line.record
+    options = {}
+    if record.search_options:
+        options["search_options"] = record.search_options
     return {
         "run": name,
         "file": line.file,
@@ -239,6 +246,7 @@ def _content(name: str, base: str, line: _Line) -> dict[str, Any]:
         "origin": record.origin,
         "measures": record.measures,
         **{key: getattr(record, key) for key in _TEXTS},
+        **options,
     }
 
 

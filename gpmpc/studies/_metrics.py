@@ -69,7 +69,10 @@ def _further_units(experiment: Experiment, flown: Flown) -> dict[str, Any]:
 
 
 def _rmse_by_axis(experiment: Experiment, flown: Flown) -> dict[str, float | None]:
-    """Returns the RMSE of every tracked state and in total; None where it diverged."""
+    """Returns the RMSE of every tracked state, of all units, and of the first unit's.
+
+    The latter is called ``total``. All are None where the flight diverged.
+    """
     tracked = experiment.system.tracked
     total = rmse(experiment, flown)
     if not np.isfinite(total):

@@ -76,9 +76,10 @@ class RunFolder:
 
     @property
     def state(self) -> RunState:
-        """Reads how far the run is; a finished run stays finished.
+        """Reads how far the run is.
 
-        A run that is flown again is running, whatever an earlier attempt left.
+        A run that is flown again is running from ``begin`` on, which puts the end of
+        the attempt before aside.
         """
         if self.finished:
             return RunState.FINISHED
@@ -181,10 +182,14 @@ class RunFolder:
             os.close(file)
 
     def begin(self, config: str) -> None:
-        """Puts an earlier failure aside and keeps the resolved settings."""
+        """Puts aside how an earlier attempt ended, and keeps the resolved settings.
+
+        A result goes: the recording that it belongs to is written anew.
+        """
         with suppress(FileNotFoundError):
             os.replace(self.path / ERROR, self.path / _EARLIER_ERROR)
         write_whole(self.path / CONFIG, config, flush=False)
+        (self.path / METRICS).unlink(missing_ok=True)
 
     def finish(self, result: Mapping[str, Any]) -> None:
         """Makes the run a finished one, without a trace of earlier failures.
@@ -311,7 +316,7 @@ def _lock_soon(file: int) -> bool:
     return False
 
 
-def record(
+def run_header(
     choices: Sequence[str], settings: Mapping[str, Any], command: str
 ) -> dict[str, Any]:
     """Returns the beginning of metrics.json and error.json: settings and provenance.
@@ -330,6 +335,7 @@ def record(
             **provenance(),
             "command": command,
             "own_code": own_code(settings),
+            "remarks": [],
         },
     }
 

@@ -6,8 +6,11 @@ printable line from here on, and a run that cannot give them raises.
 
 import json
 import math
+import shlex
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from sys import intern
 from typing import Any, NamedTuple
@@ -71,7 +74,10 @@ _COLUMNS = (
     "lost",
     "suspicious",
     "error",
+    "search_options",
 )
+# Of a command, by which it finds its settings; each with a value.
+_SEARCH_OPTIONS = ("--config-name", "--config-dir")
 
 
 class Settings(Mapping[str, Any]):
@@ -116,6 +122,8 @@ class RunRecord:
     warning: str = ""
     #: the version of the code that flew it, in words
     made_by: str = ""
+    #: the options of the command by which its settings were found, as typed
+    search_options: str = ""
     measures: Mapping[str, float | None] = field(default_factory=dict)
 
     def setting(self, key: str) -> str:
@@ -162,6 +170,7 @@ def read_record(path: Path, content: Result) -> RunRecord:
             code=code,
             error=plain_text(content["error"]),
             made_by=_made_by(content),
+            search_options=_search_options(content),
         )
     measures = {name: measure.of(content) for name, measure in MEASURES.items()}
     for name, value in measures.items():
@@ -180,6 +189,7 @@ def read_record(path: Path, content: Result) -> RunRecord:
         suspicious="" if lost else _suspicion(content),
         warning=warning_of(content) or "",
         made_by=_made_by(content),
+        search_options=_search_options(content),
         measures=measures,
     )
 
@@ -273,3 +283,16 @@ def _since(event: Any) -> str:
 
 def _made_by(content: Result) -> str:
     return plain_text(describe_code(content.get("provenance") or {}))
+
+
+def _search_options(content: Result) -> str:
+    """Returns how the command that made a run found its settings, as it was typed."""
+    provenance = content.get("provenance") or {}
+    options = []
+    with suppress(ValueError):  # an older command, whose quotes were not kept
+        words = shlex.split(provenance.get("command") or "")
+        for word, next_word in pairwise([*words, ""]):
+            option, equals, value = word.partition("=")
+            if option in _SEARCH_OPTIONS:
+                options += [option, value if equals else next_word]
+    return plain_text(shlex.join(options))

@@ -11,9 +11,10 @@ import json
 import os
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from sys import intern
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -48,7 +49,8 @@ class Report:
     - ``lost``, ``suspicious`` (at its end) and ``error``: since when and why;
     - ``folder``; ``unit`` of the errors; ``settings`` by dotted key;
     - ``origin``: date, commit and machine; ``code``: names the code that made it, ""
-      where there is none or it does not tell.
+      where there is none or it does not tell;
+    - ``search_options``: those of the command by which its settings were found.
     """
 
     #: where it is
@@ -84,8 +86,14 @@ class Report:
         }
 
     def base_settings(self) -> list[str]:
-        """Returns the settings that all runs share, one ``key: value`` each."""
-        first, *others = (run.settings for run in self.ended)
+        """Returns the settings that all runs share, one ``key: value`` each.
+
+        Runs whose process could not say what they were do not count.
+        """
+        settings_of_runs = [run.settings for run in self.ended if run.settings]
+        if not settings_of_runs:
+            return []
+        first, *others = settings_of_runs
         shared = dict(first)
         for settings in others:
             keys = [*shared]
@@ -99,20 +107,25 @@ class Report:
     def commands(self) -> list[str]:
         """Returns the commands that fly what is missing or failed, one a cell.
 
-        Skipped runs are not among them: a run is not flown over what lies in its
-        folder.
+        There are more of a cell whose settings were found in several ways, or where
+        some runs name their seed and some have the usual one. Skipped runs are not
+        among them: a run is not flown over what lies in its folder.
         """
         to_fly = self.runs[self.runs.state.isin(("missing", "failed"))]
         commands = []
-        for cell, runs in to_fly.groupby("cell"):
+        to_fly = to_fly.assign(names_seed=to_fly.seed != _DEFAULT)
+        groups = to_fly.groupby(["cell", "search_options", "names_seed"])
+        for (cell, options, names_seed), runs in groups:
             varied = dict(zip(self.variables, self.cells[cell], strict=True))
             choices = {
                 key: value
                 for key, value in (self.constants | varied).items()
                 if value != _DEFAULT
             }
-            words = ["gpmpc", "run", "-m", *_overrides(choices)]
-            words += [f"{SEED}={','.join(runs.seed)}", f"folder={self.tree}"]
+            words = ["gpmpc", "run", "-m", *shlex.split(options), *_overrides(choices)]
+            if names_seed:
+                words.append(f"{SEED}={','.join(runs.seed)}")
+            words.append(f"folder={self.tree}")
             commands.append(plain_text(shlex.join(words)))
         return commands
 
@@ -139,7 +152,7 @@ class _Files:
     """The files of a tree: runs, plans, and what cannot be read."""
 
     runs: list[RunRecord] = field(default_factory=list)
-    plans: list[Choices] = field(default_factory=list)
+    planned: list[RunRecord] = field(default_factory=list)  # as if all were missing
     skipped: list[str] = field(default_factory=list)  # with the reason, a line each
     unread_folders: set[str] = field(default_factory=set)  # names
 
@@ -165,8 +178,7 @@ def _read_files(tree: Path) -> _Files:
         index.write()
     for path in paths.plans:
         try:
-            planned_runs = _read_json(path)["runs"]
-            files.plans += map(parsed, planned_runs)
+            files.planned += _planned_runs(_read_json(path))
         except DAMAGE as error:
             files.skipped.append(_why_skipped(path, "sweep", error))
             files.unread_folders.add(path.parent.name)
@@ -203,6 +215,15 @@ class _Paths:
         )
 
 
+def _planned_runs(plan: Any) -> list[RunRecord]:
+    """Returns the runs that a sweep asked for, from the content of its plan."""
+    options = intern(plain_text(plan.get("search_options", "")))
+    return [
+        RunRecord(parsed(choices), "missing", search_options=options)
+        for choices in plan["runs"]
+    ]
+
+
 def _read_json(path: Path) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
@@ -218,11 +239,12 @@ def _not_there(files: _Files) -> list[RunRecord]:
     """Returns the runs that were planned and are missing or cannot be read."""
     names = {_name_of(run.choices) for run in files.runs}
     absent = []
-    for choices in files.plans:
-        name = _name_of(choices)
+    for run in files.planned:
+        name = _name_of(run.choices)
+        if name in files.unread_folders:
+            run = replace(run, state="skipped")
         if name not in names:
-            state = "skipped" if name in files.unread_folders else "missing"
-            absent.append(RunRecord(choices, state))
+            absent.append(run)
     return absent
 
 
@@ -299,8 +321,8 @@ def _table_of(
 def _completed_choices(runs: Sequence[RunRecord]) -> list[Choices]:
     """Returns the choices of every run, with a value for each key that any run chose.
 
-    A run that did not choose has its setting; one that is not there has that of the
-    first other run that did not choose.
+    Else the value in its own settings; a run without a file takes that of the first run
+    that left the setting alone.
     """
     keys = dict.fromkeys([*(key for run in runs for key in run.choices), SEED])
     usual = {key: _usual_setting(runs, key) for key in keys}

@@ -159,7 +159,7 @@ class SweepWatch:
             names = {entry.name for entry in entries if entry.is_dir()}
         for _ in planned - names:
             yield "", RunState.NOT_BEGUN, None
-        for name in names:
+        for name in sorted(names):
             path = f"{folder}/{name}"
             for file, state in ((METRICS, RunState.FINISHED), (ERROR, RunState.FAILED)):
                 ended = _written_at(f"{path}/{file}")

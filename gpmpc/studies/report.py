@@ -14,12 +14,12 @@ import pandas as pd
 
 from gpmpc._provenance import now
 from gpmpc.plotting import Series, over_variable, png
+from gpmpc.plotting._style import figure_label
 from gpmpc.studies._comparison import Comparison, compare, sentences
 from gpmpc.studies._document import (
     MISSING,
     Document,
     Table,
-    figure_label,
     plain_text,
     with_range,
 )

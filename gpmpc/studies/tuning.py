@@ -17,11 +17,11 @@ import pandas as pd
 
 from gpmpc.exceptions import GpmpcError
 from gpmpc.plotting import png, search_figure
+from gpmpc.plotting._style import figure_label
 from gpmpc.studies._document import (
     MISSING,
     Document,
     Table,
-    figure_label,
     number,
     plain_text,
 )

@@ -208,6 +208,13 @@ def test_a_process_of_joblib_that_dies_takes_one_chunk_with_it(tmp_path):
     jobs = jobs_of(tmp_path, "dies", "flies", "dies once", "flies", "flies", "raises")
     launcher = Joblib(tmp_path, n_jobs=2)
     flying, states = flown(launcher, jobs, size=2, retries=1)
+    # Those that wait may die as well, such as for want of memory.
+    for executor in launcher._idle:
+        (process,) = executor._processes.values()
+        process.kill()
+        executor._executor_manager_thread.join(20)
+    later = jobs_of(tmp_path / "later", "flies")
+    assert flown(launcher, later)[1] == {"0-flies": "finished"}
     launcher.close()
     assert states == {
         "0-dies": "failed",

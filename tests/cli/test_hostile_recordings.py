@@ -333,7 +333,7 @@ def test_an_ordinary_flights_settings_describe_the_same_flight(words):
         assert repr(getattr(experiment, key)) == repr(getattr(expected, key))
     for ours, theirs in (
         (experiment.system, expected.system),
-        (experiment.flown, expected.flown),
+        (experiment.plant_in_loop, expected.plant_in_loop),
     ):
         assert vars(ours.dynamics) == vars(theirs.dynamics)
         assert (ours.time_step, ours.nominal is None) == (

@@ -46,6 +46,8 @@ def test_a_lost_flight_is_readable_and_has_its_own_exit_code(choices, reason, tm
     assert reason in result["lost"]["reason"]
     run = read_run(folder / "run.mcap")
     assert run.finished
+    ended = "Diverged: " if "finite" in reason else "complete"
+    assert run.metadata["end"]["outcome"].startswith(ended)
     assert len(run.times) == result["steps"]
     assert run.times[result["lost"]["step"]] == result["lost"]["time"]
     again = forked("run", *TINY, *choices, "steps=9", cwd=tmp_path)

@@ -363,6 +363,12 @@ def test_settings_and_classes_of_the_users_own_folder_are_found(sweep, tmp_path)
     (path,) = (tmp_path / "tree").glob("*/config.yaml")
     for text in ("tolerance: 0.5", "seed: 5", "vehicle.mine"):
         assert text in path.read_text()
+    result = json.loads((path.parent / "metrics.json").read_text())
+    options = "--config-name ours --config-dir own"
+    command = result["provenance"]["command"]
+    assert command.startswith(f"gpmpc run {options} controller=mine ")
+    for plan in (tmp_path / "tree").glob("sweep-*.json"):
+        assert json.loads(plan.read_text())["search_options"] == options
 
 
 def test_kernels_are_compiled_when_asked_for(tmp_path):

@@ -1,16 +1,22 @@
 """``gpmpc tune`` as a user meets it: the best command, resumption, clear mistakes."""
 
 import json
+import math
 import re
 import shlex
+from argparse import Namespace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from gpmpc.cli import _tune
+from gpmpc.cli._settings import settings
+from gpmpc.cli._sweep import JobOutcome, Sweep
 from gpmpc.cli._tune import _cost
 from gpmpc.exceptions import DataError
+from gpmpc.studies._document import json_text
 from tests.cli.command import forked
 from tests.recording import runs
 
@@ -79,6 +85,33 @@ def test_a_search_resumes_and_its_best_settings_fly(tmp_path):
         for path in tmp_path.glob("tree/*/metrics.json")
     ]
     assert json.loads(again.stdout)["rmse"]["total"] in totals
+
+
+def test_flights_that_failed_are_told_and_cost_no_number(tmp_path, monkeypatch, capsys):
+    def fly(sweep, jobs):
+        failing = [job for job in jobs if "horizon=1" in job.choices]
+        return [JobOutcome(str(job.folder.path), "its process died") for job in failing]
+
+    def cost(job, controller):
+        return math.inf if "horizon=1" in job.choices else 1.0
+
+    monkeypatch.setattr(Sweep, "fly", fly)
+    monkeypatch.setattr(_tune, "_cost", cost)
+    arguments = Namespace(
+        config_name="tune",
+        overrides=[*TINY, "horizon=1", "horizon=2,3", f"folder={tmp_path}"],
+        trials=2,
+        batch=1,
+        seeds=1,
+    )
+    with settings():
+        result = _tune.tune(arguments)
+    (failed,) = result.data["failed"]
+    said = capsys.readouterr().err.splitlines()
+    assert said == [f"gpmpc: failed: {failed['folder']}: its process died"]
+    assert result.code == 1
+    told = json.loads(json_text(result.data), parse_constant=pytest.fail)
+    assert (told["unchanged"], told["cost"]) == (None, 1.0)
 
 
 @pytest.mark.parametrize(

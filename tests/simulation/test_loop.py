@@ -233,16 +233,23 @@ def test_every_step_is_told_as_it_happens():
     assert np.array_equal([s.input for s in reported], flight.inputs)
 
 
+class Attentive(Feedback):
+    """Keeps the references that it is asked to follow."""
+
+    def __init__(self):
+        super().__init__()
+        self.references = []
+
+    def control(self, belief, reference, previous=None):
+        self.references.append(reference)
+        return super().control(belief, reference, previous)
+
+
 def test_references_with_inputs_are_handed_on_window_by_window():
-    seen = []
-
-    class Curious(Feedback):
-        def control(self, belief, reference, previous=None):
-            seen.append(reference)
-            return super().control(belief, reference, previous)
-
+    controller = Attentive()
+    seen = controller.references
     references = Reference(np.arange(18.0).reshape(9, 2), np.arange(8.0)[:, None])
-    flight = closed_loop(PLANT, Curious(), references, START, 6)
+    flight = closed_loop(PLANT, controller, references, START, 6)
     assert all(
         np.array_equal(r.states, references.states[k : k + 4])
         for k, r in enumerate(seen)
@@ -252,6 +259,22 @@ def test_references_with_inputs_are_handed_on_window_by_window():
         for k, r in enumerate(seen)
     )
     assert np.array_equal(flight.references, references.states[:7])
+
+
+def test_kappas_move_along_a_path_and_stay_at_a_set_point():
+    controller = Attentive()
+    along = np.linspace(1.0, 2.0, 8)
+    path = Reference(np.zeros((9, 2)), kappas=along)
+    closed_loop(PLANT, controller, path, START, 6)
+    assert [list(seen.kappas) for seen in controller.references] == [
+        list(along[k : k + 3]) for k in range(6)
+    ]
+    controller = Attentive()
+    by_stage = [0.5, 1.0, 1.5]
+    closed_loop(PLANT, controller, Reference([0.0, 0.0], kappas=by_stage), START, 6)
+    assert [list(seen.kappas) for seen in controller.references] == [by_stage] * 6
+    with pytest.raises(ShapeError, match=r"kappas of a set point must be \(3,\)"):
+        closed_loop(PLANT, controller, Reference([0.0, 0.0], kappas=[1.0]), START, 6)
 
 
 @pytest.fixture(scope="module")
@@ -302,14 +325,14 @@ def test_a_plant_that_leaves_the_finite_numbers_is_said_so():
     ) as caught:
         fly(plant=System(Exploding(), 1.0, substeps=1), initial=np.array([0.0, 1.0]))
     assert caught.value.step == 1
-    flown = caught.value.flown
+    flown = caught.value.rollout
     assert flown.states[:, 1] == pytest.approx(
         [1.0, 1e60], rel=1e300
     )  # what was flown before is kept
     assert len(flown.inputs) == 1
     with pytest.raises(Diverged) as caught:
         fly(plant=System(Exploding(), 1.0, substeps=1), initial=np.array([0.0, 1e300]))
-    assert caught.value.flown is None
+    assert caught.value.rollout is None
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from gpmpc.mpc import Box, Timing
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
 from gpmpc.studies._document import terminal
-from gpmpc.studies._run_folder import PLAN, RunFolder, folder_name, record
+from gpmpc.studies._run_folder import PLAN, RunFolder, folder_name, run_header
 from gpmpc.studies.flight import Experiment, Flown, metrics
 from gpmpc.studies.report import report_document
 from gpmpc.systems import translational
@@ -70,7 +70,7 @@ def folder_of(tree, choices):
 
 def record_of(settings, choices=()):
     """What a run with settings keeps about itself."""
-    return record(list(choices), settings, "gpmpc run")
+    return run_header(list(choices), settings, "gpmpc run")
 
 
 def on_terminal(table, width):

@@ -1,15 +1,18 @@
 """One small document in every format: nothing is lost, doubled or out of its place."""
 
 import io
+import json
+import math
 
+import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
 
+from gpmpc.plotting._style import figure_label
 from gpmpc.studies._document import (
     Document,
     Table,
-    figure_label,
     json_text,
     number,
     plain_text,
@@ -251,6 +254,14 @@ def test_a_number_has_three_digits_and_a_power_that_latex_sets(value, text):
 def test_a_range_is_shown_where_there_is_one():
     assert with_range(1.0, 2.0, 3.0) == "2\n[1, 3]"
     assert with_range(2.0, 2.0, 2.0) == "2"
+
+
+def test_json_knows_finite_numbers_alone():
+    text = json_text(
+        {"mean": math.nan, "costs": [1.5, -math.inf, (np.float64("inf"),)]}
+    )
+    content = json.loads(text, parse_constant=pytest.fail)
+    assert content == {"mean": None, "costs": [1.5, None, [None]]}
 
 
 def test_labels_are_no_formulas():

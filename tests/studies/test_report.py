@@ -16,6 +16,7 @@ from omegaconf import OmegaConf
 
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import Series, over_variable
+from gpmpc.studies._run_folder import RunFolder
 from gpmpc.studies.report import compare, read_report, sentences, terminal_table
 from tests.studies.made_up import (
     SETTINGS,
@@ -71,6 +72,53 @@ def test_the_gaps_come_with_the_command_that_fills_them(tree):
     assert read_report(tree).commands() == [
         f"gpmpc run -m controller=lqr seed=6,7 folder={tree}"
     ]
+
+
+def lose(tree, choices, command="gpmpc run"):
+    """Leaves a run whose process died before it could say what its settings were."""
+    about = {
+        "choices": choices,
+        "settings": {},
+        "provenance": {"command": command},
+    }
+    RunFolder(folder_of(tree, choices)).lose("its process died", "crash", about)
+
+
+def test_gaps_of_runs_without_a_seed_are_filled_without_one(tmp_path):
+    for controller in ("convex", "lqr"):
+        lose(tmp_path, [f"controller={controller}"])
+    for _ in ("from the folders", "from the index"):
+        report = read_report(tmp_path)
+        assert report.commands() == [
+            f"gpmpc run -m controller={controller} folder={tmp_path}"
+            for controller in ("convex", "lqr")
+        ]
+        assert report.base_settings() == []
+
+
+def test_a_lost_run_leaves_the_settings_of_all_others_told(tree):
+    shared = read_report(tree).base_settings()
+    assert "horizon: 10" in shared
+    lose(tree, chosen("lqr", 7)[0])
+    assert read_report(tree).base_settings() == shared
+
+
+def test_gaps_are_filled_with_the_settings_of_the_users_folder(tmp_path):
+    add(tmp_path, "lqr", 0, 0.1)
+    lose(
+        tmp_path,
+        chosen("lqr", 1)[0],
+        "gpmpc run --config-dir 'my own' --config-name=mine controller=lqr seed=1",
+    )
+    runs = [chosen("lqr", seed)[0] for seed in (2, 3)]
+    content = {"runs": runs, "search_options": "--config-dir own"}
+    (tmp_path / "sweep-1.json").write_text(json.dumps(content))
+    for _ in ("from the folders", "from the index"):
+        assert read_report(tmp_path).commands() == [
+            f"gpmpc run -m --config-dir 'my own' --config-name mine controller=lqr "
+            f"seed=1 folder={tmp_path}",
+            f"gpmpc run -m --config-dir own controller=lqr seed=2,3 folder={tmp_path}",
+        ]
 
 
 def test_without_a_sweep_nothing_is_missing(tmp_path):

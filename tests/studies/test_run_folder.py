@@ -19,7 +19,7 @@ from gpmpc.studies._run_folder import (
     difference,
     folder_name,
     of_other_code,
-    record,
+    run_header,
 )
 
 
@@ -109,7 +109,7 @@ def test_a_failure_is_kept_with_its_kind_and_where_it_was_raised(tmp_path):
 
 def test_a_result_of_other_settings_or_none_is_refused(tmp_path):
     folder = RunFolder(tmp_path)
-    about = record(["b=2", "a=1"], {"seed": 7, "steps": 3}, "gpmpc run")
+    about = run_header(["b=2", "a=1"], {"seed": 7, "steps": 3}, "gpmpc run")
     folder.finish(about)
     assert (
         folder.result()
@@ -137,7 +137,7 @@ def test_a_result_of_other_settings_or_none_is_refused(tmp_path):
 
 def test_what_flew_a_run_is_told_as_far_as_it_says_so():
     settings = {"seed": 7}
-    about = record([], settings, "gpmpc run")
+    about = run_header([], settings, "gpmpc run")
     assert of_other_code(about) == ""
     said = {
         "gpmpc 1.2": {"versions": {"gpmpc": "1.2"}},

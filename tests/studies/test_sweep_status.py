@@ -62,6 +62,13 @@ def test_runs_are_counted_by_their_state(tree):
     )
 
 
+def test_reasons_of_equal_counts_stand_in_the_order_of_runs(tmp_path):
+    reasons = [f"reason {letter}" for letter in "hgfedcba"]
+    for i, reason in enumerate(reasons):
+        run(tmp_path, f"seed={i}", "config.yaml", "error.json", error=reason)
+    assert [*SweepWatch(tmp_path).look().failures] == reasons
+
+
 def test_each_look_sees_what_has_changed(tree):
     watch = SweepWatch(tree)
     assert watch.look().counts[RunState.FAILED] == 3

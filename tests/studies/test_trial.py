@@ -1,5 +1,6 @@
 """A trial is put together from its experiment: its data, its flight and its start."""
 
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -64,7 +65,7 @@ def test_a_flight_has_references_for_all_that_its_last_plan_sees(loops):
     chosen = experiment(plant=heavy, noise=noise, seed=4, on_failure="raise")
     object.__setattr__(chosen, "disturbances", (gust,))
     flown = run_trial(
-        chosen, lambda *prepared: prepared_trials.append(prepared) or STEP
+        chosen, lambda *prepared: prepared_trials.append(prepared) or nullcontext(STEP)
     )
     rehearsed, (arguments, keywords) = loops
     system, controller, reference, start, steps = arguments
@@ -147,13 +148,38 @@ def test_a_diverged_flight_is_its_flown_part_or_raises(loops, monkeypatch):
     monkeypatch.setattr(_flight, "closed_loop", diverge)
     with pytest.raises(Diverged):
         run_trial(experiment())
-    error.flown = ROLLOUT
+    error.rollout = ROLLOUT
     flown = run_trial(experiment())
     assert (flown.rollout, flown.diverged, flown.controller.made_of) == (
         ROLLOUT,
         error,
         MODEL,
     )
+
+
+def test_a_recording_sees_how_its_flight_ends(loops, monkeypatch):
+    ends = []
+
+    @contextmanager
+    def open_recording(controller, training):
+        try:
+            yield STEP
+        except Diverged as error:
+            ends.append(str(error))
+            raise
+        ends.append("complete")
+
+    run_trial(experiment(), open_recording)
+    error = Diverged(3, "away")
+    error.rollout = ROLLOUT
+
+    def diverge(*_, on_step, **__):
+        assert on_step is STEP
+        raise error
+
+    monkeypatch.setattr(_flight, "closed_loop", diverge)
+    assert run_trial(experiment(), open_recording).diverged is error
+    assert ends == ["complete", "step 3: away"]
 
 
 def test_episodes_have_own_seeds_and_the_best_model_flies_last(monkeypatch):
@@ -165,8 +191,8 @@ def test_episodes_have_own_seeds_and_the_best_model_flies_last(monkeypatch):
         learned.append((list(data), seed))
         return SimpleNamespace(posterior=f"model {len(learned)}")
 
-    def fly(experiment, prepare, model, training, warn):
-        flown.append((experiment.seed, prepare, model))
+    def fly(experiment, open_recording, model, training, warn):
+        flown.append((experiment.seed, open_recording, model))
         return Flown(f"flight {len(flown)}", None, training)
 
     monkeypatch.setattr(Experiment, "training_rows", lambda _: ["rows"])

@@ -160,7 +160,7 @@ def test_an_episode_that_ends_is_a_lost_flight():
         Diverged, match="the simulator has ended its episode, at state"
     ) as caught:
         closed_loop(system, Pushing(), np.zeros((203, 2)), None, 200)
-    assert np.abs(caught.value.flown.states[-1, 0]) < 10
+    assert np.abs(caught.value.rollout.states[-1, 0]) < 10
     with pytest.raises(SettingError, match="a simulator flies one seed after another"):
         closed_loops(system, Pushing(), np.zeros((3, 2)), None, 2, seeds=2)
 
