@@ -43,7 +43,11 @@ def _concerns(error: OSError, folder: Path) -> bool:
         return True
     file = Path(os.path.abspath(os.fsdecode(error.filename)))
     absolute = Path(os.path.abspath(folder))
-    return file.is_relative_to(absolute) or absolute.is_relative_to(file)
+    # Where ``folder`` is a file, that is written beside it first.
+    is_beside = file.parent == absolute.parent
+    is_partial = is_beside and file.name.startswith(f".{absolute.name}.")
+    is_inside = file.is_relative_to(absolute)
+    return is_inside or is_partial or absolute.is_relative_to(file)
 
 
 def write_files(

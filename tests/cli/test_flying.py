@@ -211,7 +211,7 @@ def test_a_process_of_joblib_that_dies_takes_one_chunk_with_it(tmp_path):
     # Those that wait may die as well, such as for want of memory.
     for executor in launcher._idle:
         (process,) = executor._processes.values()
-        process.kill()
+        os.kill(process.pid, signal.SIGKILL)
         executor._executor_manager_thread.join(20)
     later = jobs_of(tmp_path / "later", "flies")
     assert flown(launcher, later)[1] == {"0-flies": "finished"}
