@@ -345,7 +345,7 @@ def _cells(row: PointRow, chosen: bool) -> list[str]:
     cost = f"{row.cost:.4f}" if math.isfinite(row.cost) else "lost"
     return [
         f"{row.points} chosen" if chosen else str(row.points),
-        f"{row.error:.4f}",
+        "-" if math.isnan(row.error) else f"{row.error:.4f}",
         cost,
         _words("flash", footprint.flash),
         _words("ram", footprint.ram),

@@ -20,6 +20,8 @@ from gpmpc.signals import Signals
 from gpmpc.simulation import Rollout
 
 Array = np.ndarray
+# of a state, below which an error is round-off
+_EXACT = 1e-12
 #: flies a controller
 Fly = Callable[[Any], Rollout]
 
@@ -102,11 +104,11 @@ def ratio_of_errors(
     """Returns the root mean square of one-step errors, beside that of all points.
 
     Each state's errors count in units of its error by all points; states that these
-    predict exactly, such as inputs on their way, do not count.
+    predict exactly, such as inputs on their way, do not count. NaN where all are.
     """
     errors = _squared_errors(model, flight)
     least = _squared_errors(all_points, flight)
-    counts = np.isfinite(least) & (least > 0)
+    counts = least > (_EXACT * np.nanmax(np.abs(flight.states), axis=0)) ** 2
     if not counts.any():
         return math.nan
     return float(np.sqrt((errors[counts] / least[counts]).mean()))

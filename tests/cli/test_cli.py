@@ -114,6 +114,15 @@ def test_help_lists_the_commands_and_a_commands_settings(tmp_path):
         ),
         (["tables", "folder="], "folder: must be the path of a folder; got ''"),
         (["tables", "seed="], "seed: must be a whole number"),
+        (
+            ["export", "c", "run", "--budget", "flash=64kg"],
+            "budget: flash must be a number with k or M, such as flash=64kB; got "
+            "'flash=64kg'",
+        ),
+        (
+            ["export", "c", "run", "--points", "9", "--budget", "ram=9kB"],
+            "--points: is chosen by --budget; leave one of them out",
+        ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

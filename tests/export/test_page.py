@@ -11,7 +11,7 @@ from tests.pages import BLOCK, read
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
 
 
-@pytest.mark.slow  # half a minute: it learns twice and compiles four times
+@pytest.mark.slow  # minutes: it learns thrice and compiles some twenty times
 def test_the_ten_minutes_of_the_page(page, tmp_path):
     names, printed = page("docs/export.md")
     assert "other statuses" in printed[1]
