@@ -4,7 +4,8 @@ A fold says something only where its training rows cover what its held-out rows 
 transient and then rest, cut into two halves, asks each model to extrapolate to the
 other half, and every model but the simplest is refused. So runs are dealt to folds
 where there are many; of few runs, blocks of rows take turns, with a gap between them in
-the training rows, so that no held-out window overlaps what a model was fitted to.
+the training rows, so that no row to predict is near what a model was fitted to. What a
+prediction begins with, the past, may be rows of the block before.
 
 Half of many rows says what all of them say. Of a short log it does not, and structures
 are chosen that suit half of its rows: there four folds hold out a quarter each.
@@ -30,6 +31,7 @@ _DEALS = 60  # ways to deal runs that are compared
 _BALANCED = 0.6  # least rows of a fold, of their mean
 _NEARLY = 0.02  # of the coverage that decides nothing
 _MARGIN = 0.02  # of a range by which it may be exceeded
+_ROLLOUTS = 2  # of the longest, one after the other, that a block is to have rows for
 _GAP_SHARE = 6  # a gap is no longer than a block divided by this
 _COUNTS = {2: "two", 4: "four"}
 
@@ -79,7 +81,7 @@ def split_folds(log: Log, past: int, steps: int, most: int = _FOLDS_OF_SHORT) ->
             return folds
     folds = _split(log, 2, past, steps)
     if folds is None:
-        return _halves(log)
+        return _halves(log, past)
     return folds
 
 
@@ -91,11 +93,13 @@ def _split(log: Log, count: int, past: int, steps: int) -> Folds | None:
     best_deal = _best(splits)
     if best_deal is not None and best_deal.coverage >= 1 - 5 * _NEARLY:
         return best_deal
+    short: list[Folds] = []
     for blocks in _BLOCKS:
         folds = _blocks(log, count, blocks, past, steps)
         if folds is not None:
-            splits.append(folds)
-    return _best(splits)
+            is_short = len(log) / blocks < _ROLLOUTS * steps
+            (short if is_short else splits).append(folds)
+    return _best(splits or short)
 
 
 def _best(splits: list[Folds]) -> Folds | None:
@@ -146,10 +150,11 @@ def _blocks(log: Log, folds: int, count: int, past: int, steps: int) -> Folds | 
     """Returns folds of blocks that take turns; None where these are too short."""
     window = past + steps
     length = len(log) / count
-    gap = min(window, int(length / _GAP_SHARE), (int(length) - window - 1) // 2)
+    between = int((folds - 1) * length)  # rows between two blocks of a fold
+    gap = min(window, int(length / _GAP_SHARE), (between - window - 1) // 2)
     if gap < 0:
         return None
-    blocks = _blocks_of_runs(log, folds, length)
+    blocks = _blocks_of_runs(log, folds, length, past)
     if len(blocks) < folds:
         return None
     held_out: list[tuple[LogRun, ...]] = []
@@ -179,12 +184,15 @@ class _Block(NamedTuple):
     fold: int
 
 
-def _blocks_of_runs(log: Log, folds: int, length: float) -> list[_Block]:
-    """Cuts runs into blocks of about a length, which take turns to be held out."""
+def _blocks_of_runs(log: Log, folds: int, length: float, past: int) -> list[_Block]:
+    """Cuts runs into blocks of about a length, which take turns to be held out.
+
+    Each has so many rows of the past before those that are to be predicted.
+    """
     blocks: list[_Block] = []
     for number, run in enumerate(log):
         for begin, end in itertools.pairwise(_cuts(run, length)):
-            rows = run.part(begin, end, f"block {len(blocks) + 1}")
+            rows = run.part(max(begin - past, 0), end, f"block {len(blocks) + 1}")
             blocks.append(_Block(rows, number, begin, end, len(blocks) % folds))
     return blocks
 
@@ -220,12 +228,19 @@ def _cuts(run: LogRun, length: float) -> list[int]:
     return np.unique(cuts).tolist()
 
 
-def _halves(log: Log) -> Folds:
-    """Returns folds of the first and the second half of every run."""
+def _halves(log: Log, past: int) -> Folds:
+    """Returns folds of the first and the second half of every run.
+
+    Held out, the second half has so many rows of the past before it.
+    """
     first, second = log.split_by_time(0.5)
+    with_past = []
+    for run, half in zip(log, first, strict=True):
+        begin = max(len(half) - past, 0)
+        with_past.append(run.part(begin, len(run), "last part"))
     return _folds(
         log,
-        held_out=[first.runs, second.runs],
+        held_out=[first.runs, tuple(with_past)],
         train=[second.runs, first.runs],
         words="two halves by time: the log is too short for more",
     )

@@ -9,11 +9,9 @@ from gpmpc.logs._baselines import CONSTANT_STATE, baseline_errors
 from gpmpc.logs._comparison import Comparison, compare
 from gpmpc.logs._folds import Fold
 from gpmpc.logs._log import Log
-from gpmpc.logs._structures import MOST_PAST
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._log_model import LogModel
 
-PAST_ROWS = MOST_PAST  # of the windows that structures are compared on
 _JUDGED = (1, 10, 50)  # steps whose errors decide
 _WINDOWS = 400  # that structures are compared on
 _EXACT = 1e-4  # of a constant state's error: what is smaller counts as exact
@@ -26,11 +24,17 @@ class HeldOutErrors:
         log: All runs.
         folds: Of the log.
         kinematics: Of all models.
+        past: Rows before the start of each.
         steps: Of the rollouts.
     """
 
     def __init__(
-        self, log: Log, folds: Sequence[Fold], kinematics: Kinematics, steps: int
+        self,
+        log: Log,
+        folds: Sequence[Fold],
+        kinematics: Kinematics,
+        past: int,
+        steps: int,
     ):
         self._space = log.space
         self._folds = folds
@@ -39,7 +43,7 @@ class HeldOutErrors:
         self.judged_steps = tuple(sorted({min(step, steps) for step in _JUDGED}))
         #: of each fold
         self.windows = [
-            fold.held_out.windows(steps, past=PAST_ROWS, most=_WINDOWS // len(folds))
+            fold.held_out.windows(steps, past=past, most=_WINDOWS // len(folds))
             for fold in folds
         ]
         self._baselines = self._baseline_distances(kinematics)

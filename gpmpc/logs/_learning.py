@@ -22,10 +22,9 @@ from gpmpc.logs._comparison import Comparison
 from gpmpc.logs._control_fitness import ControlFitness, judge_for_control
 from gpmpc.logs._fitting import STEPS, NominalFit
 from gpmpc.logs._folds import MANY_RUNS, split_folds
-from gpmpc.logs._held_out_errors import PAST_ROWS
 from gpmpc.logs._log import Log
 from gpmpc.logs._search import Search
-from gpmpc.logs._structures import Candidate
+from gpmpc.logs._structures import Candidate, most_reach, past_rows
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._namings import NO_NAMINGS, Namings
@@ -104,16 +103,19 @@ def learn(
         raise SettingError("for_control", rule)
     advice = "Say kind: angle of it in the mapping"
     warn_of_turns(log.transitions(), log.space.angles, advice)
-    affordable = _most_steps(log)
+    reach = most_reach(log, for_control)
+    past = past_rows(reach)
+    affordable = _most_steps(log, past)
     if affordable < steps:
         progress(f"short log: rollouts of {affordable} steps decide, not of {steps}")
         steps = affordable
     has_few_parameters = for_control or log.mapping.model != "none"
-    folds = split_folds(log, PAST_ROWS, steps, most=2 if has_few_parameters else 4)
+    folds = split_folds(log, past, steps, most=2 if has_few_parameters else 4)
     progress(folds.sentence)
     search = Search(
         log=log,
         folds=folds.parts,
+        reach=reach,
         points=points,
         steps=steps,
         seed=seed,
@@ -125,12 +127,12 @@ def learn(
     return _identify(search, log, folds.sentence, progress, for_control)
 
 
-def _most_steps(log: Log) -> int:
+def _most_steps(log: Log, past: int) -> int:
     """Returns the most steps, two at least, of which any fold of a log has windows."""
     longest = max(end - begin for run in log for begin, end in run.pieces)
     if len(log.runs) < MANY_RUNS:
         longest //= 2  # runs are halved where nothing else is possible
-    return max(longest - PAST_ROWS - 2, 2)
+    return max(longest - past - 2, 2)
 
 
 def _identify(

@@ -26,6 +26,7 @@ from gpmpc.models._windows import Windows
 
 _STEPS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # whose errors are explained
 _WINDOWS = 2000  # of a fold, whose errors count
+_COMPARED = 250  # of a log, on which models of more and of fewer rows are compared
 _LINEARIZED = 400  # of all folds, along which rollouts are linearised: these are slow
 _LINEARIZED_WITH_MEMORY = 120  # likewise of models with many entries to carry on
 _STRIDE_WITH_MEMORY = 8  # of the windows that are linearised of these
@@ -50,7 +51,7 @@ def error_variances(
     variances = np.concatenate([noise.outputs.ravel(), noise.measurement])
     stride = 1 if model.memory.empty else _STRIDE_WITH_MEMORY
     # Neighbours respond alike.
-    responses = _responses(model, windows[::stride], steps)
+    responses = _responses(model, windows[::stride], steps, noise.time_constants)
     explained = responses @ variances * noise.scales_at(steps)
     return np.repeat(explained, stride, axis=0)[: len(windows)]
 
@@ -143,6 +144,43 @@ def fit_noise(
     )
 
 
+def learning_gains(
+    fewer: Sequence[LogModel],
+    models: Sequence[LogModel],
+    logs: Sequence[Log],
+    steps: Sequence[int],
+    exponent: float,
+) -> Array:
+    """Estimates by what factor squared errors (steps, e) fall with the rows to come.
+
+    A model of all rows errs less than those that held some out. How much less, the
+    errors of models of fewer rows say, upon a power law of the number of rows
+    (Cortes et al., 1993, Learning curves). With g the mean logarithm over the held-out
+    logs and s its standard error, as much as g^2 / (g^2 + s^2) of it is taken.
+
+    Args:
+        fewer: Models of fewer rows, one for each log.
+        models: Models of more rows, likewise.
+        logs: The runs that neither was fitted to.
+        steps: After the starts.
+        exponent: Logarithm of the rows to come over that of the rows that the one model
+            has more than the other.
+    """
+    ratios = []
+    for few, model, log in zip(fewer, models, logs, strict=True):
+        past = max(few.past, model.past, PAST)
+        windows = log.windows(max(steps), past=past, most=_COMPARED)
+        squared = [
+            np.square(one.rollout_errors(windows, steps)).mean(axis=0)
+            for one in (few, model)
+        ]
+        ratios.append(np.log(_scales(model.kinematics, squared[1], squared[0])))
+    gain = np.minimum(np.mean(ratios, axis=0), 0.0)
+    variance = np.var(ratios, axis=0, ddof=1) / len(ratios)
+    agreement = gain**2 / np.maximum(gain**2 + variance, _NOTHING)
+    return np.exp(exponent * agreement * gain)
+
+
 def _scales(kinematics: Kinematics, squared: Array, explained: Array) -> Array:
     """Computes squared errors over explained variances (steps, e), by group."""
     scales = np.ones_like(squared)
@@ -171,7 +209,7 @@ def _fold_errors(
     measured, modelled = model.first_outputs(windows)
     return _FoldErrors(
         squared=np.square(model.rollout_errors(windows, steps)),
-        responses=_responses(model, windows[::stride], steps),
+        responses=_responses(model, windows[::stride], steps, TIME_CONSTANTS),
         squared_residuals=np.square(measured - modelled),
     )
 
@@ -199,11 +237,22 @@ def _sharing_rows(model: LogModel, factor: Array, residuals: Array) -> Array:
     return np.array(rows).reshape(-1, len(factor))
 
 
-def _responses(model: LogModel, windows: Windows, steps: Sequence[int]) -> Array:
+def _responses(
+    model: LogModel,
+    windows: Windows,
+    steps: Sequence[int],
+    time_constants: Sequence[float],
+) -> Array:
     """Computes the variances of errors by a unit variance of every source.
 
     One pass from the last step to the first carries the derivatives of the state at
     each of the steps by what the model carries on, and sums what each source adds.
+
+    Args:
+        model: Whose rollouts are linearised.
+        windows: W of them, along which they are.
+        steps: After the starts.
+        time_constants: Of the noise of every output [rows].
 
     Returns:
         (W, steps, e, sources), the sources those of the outputs by time constant, then
@@ -216,11 +265,9 @@ def _responses(model: LogModel, windows: Windows, steps: Sequence[int]) -> Array
     carried = model.rollout_carried(windows, max(steps))
     E = carried.shape[-1] - windows.space.dim + e
     by_start = np.zeros((W, len(steps), e, E))
-    tails = np.zeros((len(TIME_CONSTANTS), W, len(steps), e, o))
+    tails = np.zeros((len(time_constants), W, len(steps), e, o))
     sums = np.zeros_like(tails)
-    rhos = [
-        np.exp(-windows.time_step / max(constant, 1e-9)) for constant in TIME_CONSTANTS
-    ]
+    rhos = [np.exp(-1 / max(constant, 1e-9)) for constant in time_constants]
     for k in range(max(steps) - 1, -1, -1):
         A, B = _linearized_step(model, windows, k, carried[:, k], disturbance)
         for s, step in enumerate(steps):
@@ -232,7 +279,7 @@ def _responses(model: LogModel, windows: Windows, steps: Sequence[int]) -> Array
         for t, rho in enumerate(rhos):  # the sum over i, j of rho^|i - j| G_i G_j
             sums[t] += G * (G + 2 * tails[t])
             tails[t] = rho * (tails[t] + G)
-    output_sources = len(TIME_CONSTANTS) * o
+    output_sources = len(time_constants) * o
     responses = np.empty((W, len(steps), e, output_sources + e))
     for t, total in enumerate(sums):
         responses[..., t * o : (t + 1) * o] = total

@@ -5,7 +5,8 @@
 2. Groups of outputs: those of one nominal structure, the others of another.
 3. GPs on the groups of outputs, from none and from all at once, by the change of one
    group at a time that helps most.
-4. A correction by the past upon the best structure.
+4. A correction by the past upon the best structure, unless it costs more than little:
+   it hedges against runs that are unlike those of the log.
 
 A structure's score is the mean, over groups and steps, of the logarithm of its error
 over that of the best baseline; where it is behind, that counts twice. A simulation of
@@ -24,7 +25,7 @@ from gpmpc.logs._comparison import Comparison
 from gpmpc.logs._fitting import NominalFit
 from gpmpc.logs._folds import Fold
 from gpmpc.logs._free_simulation import FreeSimulation
-from gpmpc.logs._held_out_errors import PAST_ROWS, HeldOutErrors
+from gpmpc.logs._held_out_errors import HeldOutErrors
 from gpmpc.logs._log import Log
 from gpmpc.logs._stability import grows_outside
 from gpmpc.logs._structure_fits import StructureFits
@@ -34,6 +35,7 @@ from gpmpc.logs._structures import (
     Structure,
     additions,
     bases,
+    past_rows,
 )
 from gpmpc.logs._validation import Validations
 from gpmpc.models._kinematics import RigidBodyKinematics
@@ -50,6 +52,7 @@ _ROWS_SEEN = 8  # most past rows that a GP sees
 _NOTHING = 1e-9  # of the outputs: a residual that is none
 _OUT_OF_REACH = 0.5  # mean logarithm by which rollouts are too bad to be simulated
 _UNSTABLE = 10.0  # of the score of what grows without bounds outside of its data
+_HEDGE = 0.03  # of the score, that a correction may cost
 _LOSS = 2.0  # weight of being behind a baseline
 _ROUNDS = 8  # of changes of the GPs of one nominal structure, at most
 
@@ -60,6 +63,7 @@ class Search:
     Args:
         log: All runs.
         folds: Of the log.
+        reach: Most rows that a structure may look back on.
         points: Rows that a GP is trained on.
         steps: Of the rollouts.
         seed: Of every random number.
@@ -73,6 +77,7 @@ class Search:
         self,
         log: Log,
         folds: Sequence[Fold],
+        reach: int,
         points: int,
         steps: int,
         seed: int,
@@ -87,9 +92,10 @@ class Search:
         self._progress = progress
         self._memory = memory
         self._for_control = for_control
-        self._bases = bases(log)
+        self._bases = bases(log, reach)
         kinematics = self._bases[0].model.kinematics
-        self._held_out = HeldOutErrors(log, folds, kinematics, steps)
+        past = past_rows(reach)
+        self._held_out = HeldOutErrors(log, folds, kinematics, past, steps)
         self.judged_steps = self._held_out.judged_steps
         self._fits = StructureFits(
             log=log,
@@ -101,13 +107,13 @@ class Search:
             memory=memory,
         )
         self._validations = Validations(
-            log, folds, self._fits, steps, self.judged_steps
+            log, folds, self._fits, past, steps, self.judged_steps
         )
         self._structures: dict[str, Structure] = {}
         self._errors: dict[str, Array] = {}  # means, by the structure's key
         self._simulation: FreeSimulation | None = None
         if not for_control:
-            self._simulation = FreeSimulation.of(folds, PAST_ROWS, steps)
+            self._simulation = FreeSimulation.of(folds, past, steps)
         self._simulated: dict[str, Array] = {}
         self._best_logarithm = np.inf  # mean of the errors of rollouts, over baselines
         self._unstable: set[str] = set()  # keys of nominal structures
@@ -149,6 +155,11 @@ class Search:
 
     def score(self, structure: Structure) -> float:
         """Returns the score of a structure that was considered; smaller is better."""
+        hedge = _HEDGE if structure.shares else 0.0
+        return self._logarithm(structure) + _PIECE * structure.size - hedge
+
+    def _logarithm(self, structure: Structure) -> float:
+        """Computes the mean logarithm of errors over those of the best baselines."""
         logarithms = self._held_out.logarithms(self._errors[structure.key])
         simulated = self._simulated[structure.uncorrected.key]
         if len(simulated):
@@ -157,7 +168,7 @@ class Search:
         total = logarithms.mean() + (_LOSS - 1) * behind.mean()
         if structure.nominal.key in self._unstable:
             total += _UNSTABLE
-        return float(total) + _PIECE * structure.size
+        return float(total)
 
     def _ranked(self, structures: Iterable[Structure]) -> list[Structure]:
         """Returns structures that were considered, the best one first."""
@@ -473,7 +484,7 @@ class Search:
         """Enters a candidate with its errors."""
         self._structures[structure.key] = structure
         self._errors[structure.key] = errors
-        relative = np.exp(self.score(structure) - _PIECE * structure.size)
+        relative = np.exp(self._logarithm(structure))
         best = " (best so far)" if self.best is structure else ""
         self._progress(
             f"{structure.name}: {relative:.3f} of the best baselines' errors{best}"

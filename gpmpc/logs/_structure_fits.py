@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpmpc.logs._fit_form import fit_from
-from gpmpc.logs._fitting import NominalFit
+from gpmpc.logs._fitting import PAST, NominalFit
 from gpmpc.logs._folds import Fold
-from gpmpc.logs._held_out_errors import PAST_ROWS
 from gpmpc.logs._log import Log
 from gpmpc.logs._output_gps import train_output_gp
 from gpmpc.logs._smoothing import smooth
@@ -120,7 +119,10 @@ class StructureFits:
         models = [model for model in by_fold if model is not None]
         if len(models) < len(by_fold):
             return None
-        structure = Structure("", models[0], parts[0][0].inputs, parts=parts)
+        first = parts[0][0]
+        structure = replace(
+            first, base="", model=models[0], ranges=(), additions=(), parts=parts
+        )
         self._nominal_models[structure.key] = models
         return structure
 
@@ -155,10 +157,10 @@ class StructureFits:
         smoothed = smooth(log, self._kinematics, self._seed)
         if smoothed is None:
             return _TrainingData(log, None)
-        windows = log.windows(0, past=PAST_ROWS, most=_FILTERED_WINDOWS)
-        states = smoothed.windows(0, past=PAST_ROWS, most=_FILTERED_WINDOWS).states
+        windows = log.windows(0, past=PAST, most=_FILTERED_WINDOWS)
+        states = smoothed.windows(0, past=PAST, most=_FILTERED_WINDOWS).states
         start_filter = StartFilter.fit(
-            self._kinematics, windows, states[:, PAST_ROWS], _FILTER_PENALTY
+            self._kinematics, windows, states[:, PAST], _FILTER_PENALTY
         )
         return _TrainingData(smoothed, start_filter)
 

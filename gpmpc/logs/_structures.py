@@ -28,7 +28,7 @@ from gpmpc.logs._fitting import PAST
 from gpmpc.logs._log import Log
 from gpmpc.logs._system_structures import system_nominal
 from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
-from gpmpc.models._log_model import LogModel
+from gpmpc.models._log_model import LAG_ROWS, LogModel
 from gpmpc.models._memory import Memory, Products
 from gpmpc.models._parametric import AffineNominal, MultirotorNominal
 from gpmpc.models._system_nominal import SystemNominal
@@ -53,8 +53,7 @@ _MEMORIES = {
 _PRODUCTS = ((2, 3), (2, 2), (1, 3), (1, 2))
 _MOST_PRODUCTS = 36
 _COUNTS = {2: "two", 3: "three"}
-# Rows before a start that any structure needs.
-MOST_PAST = max(PAST, *(memory.reach for _, memory in _MEMORIES.values())) + LATE + 1
+_PIECE_SHARE = 10  # of a piece: a structure looks back on no more rows of it
 
 
 @dataclass(frozen=True)
@@ -75,6 +74,7 @@ class Addition:
     #: adds it to a model; returns None where it makes no sense
     extend: Callable[[LogModel], LogModel | None]
     for_control: bool = True  #: whether a controller can plan with it
+    reach: int = 0  #: rows that it looks back on
 
 
 class GroupGP(NamedTuple):
@@ -105,6 +105,7 @@ class Structure:
     base: str  #: that it grew from, such as "rigid body"
     model: LogModel  #: nominal part, history and lag
     inputs: int  #: number of inputs
+    reach: int  #: most rows that its additions may look back on
     #: smallest and largest features in the log (2, d); empty where no term needs them
     ranges: tuple[tuple[float, ...], ...] = ()
     additions: tuple[Addition, ...] = ()
@@ -141,9 +142,12 @@ class Structure:
 
     @property
     def size(self) -> int:
-        """Number of the pieces that it is made of, to prefer what is simpler."""
+        """Number of the pieces that it is made of, to prefer what is simpler.
+
+        A correction is none: it hedges against runs that are unlike those of the log.
+        """
         parts = sum(part.size for part, _ in self.parts)
-        return len(self.additions) + len(self.gps) + parts + bool(self.shares)
+        return len(self.additions) + len(self.gps) + parts
 
     @property
     def nominal(self) -> "Structure":
@@ -175,22 +179,49 @@ def _words(names: Sequence[str]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def bases(log: Log) -> list[Structure]:
-    """Returns the structures that a search begins with, all of which are tried."""
+def most_reach(log: Log, for_control: bool) -> int:
+    """Returns how many rows a structure of a log may look back on.
+
+    It is a tenth of a piece as most rows are in. Beyond that, short runs leave few
+    windows, and what looks best on these is chance. A controller's model has lags or
+    nothing: there it is as many as they need.
+    """
+    if for_control:
+        return _REACHES[-1]
+    lengths = sorted(end - begin for run in log for begin, end in run.pieces)
+    rows = np.cumsum(lengths)
+    typical = lengths[int(np.searchsorted(rows, rows[-1] / 2))]
+    affordable = typical // _PIECE_SHARE
+    return max([reach for reach in _REACHES if reach <= affordable], default=0)
+
+
+def past_rows(reach: int) -> int:
+    """Returns the rows before a start that structures of a reach need at most."""
+    return max(PAST, reach) + LATE + 1
+
+
+def bases(log: Log, reach: int) -> list[Structure]:
+    """Returns the structures that a search begins with, all of which are tried.
+
+    Args:
+        log: All runs.
+        reach: Most rows that they may look back on.
+    """
     if log.mapping.model == "rigid_body":
         body = RigidBodyKinematics(log.space)
-        return [_multirotor_base(log), *_affine_bases(body, len(log.input_names))]
+        affine_bases = _affine_bases(body, len(log.input_names), reach)
+        return [_multirotor_base(log, reach), *affine_bases]
     kinematics = Increments(log.space)
     ranges = _ranges_of_features(kinematics, log)
-    affine_bases = _affine_bases(kinematics, len(log.input_names), ranges)
+    affine_bases = _affine_bases(kinematics, len(log.input_names), reach, ranges)
     nominal = system_nominal(log)
     if nominal is None:
         return affine_bases
-    return [_system_base(nominal, kinematics, len(log.input_names)), *affine_bases]
+    return [_system_base(nominal, kinematics, log, reach), *affine_bases]
 
 
 def _system_base(
-    nominal: SystemNominal, kinematics: Increments, inputs: int
+    nominal: SystemNominal, kinematics: Increments, log: Log, reach: int
 ) -> Structure:
     model = LogModel(
         kinematics=kinematics,
@@ -198,10 +229,11 @@ def _system_base(
         theta=np.empty(0),
         history=(0,) * len(kinematics.output_names),
     )
-    return Structure(nominal.code.rpartition(":")[2], model, inputs)
+    name = nominal.code.rpartition(":")[2]
+    return Structure(name, model, len(log.input_names), reach)
 
 
-def _multirotor_base(log: Log) -> Structure:
+def _multirotor_base(log: Log, reach: int) -> Structure:
     nominal = MultirotorNominal(
         motors=len(log.input_names),
         voltage=_median_voltage(log),
@@ -213,7 +245,7 @@ def _multirotor_base(log: Log) -> Structure:
         theta=np.empty(0),
         history=(0,) * 6,
     )
-    return Structure("rigid body", model, len(log.input_names))
+    return Structure("rigid body", model, len(log.input_names), reach)
 
 
 def _ranges_of_features(
@@ -232,7 +264,10 @@ def _ranges_of_features(
 
 
 def _affine_bases(
-    kinematics: Kinematics, inputs: int, ranges: tuple[tuple[float, ...], ...] = ()
+    kinematics: Kinematics,
+    inputs: int,
+    reach: int,
+    ranges: tuple[tuple[float, ...], ...] = (),
 ) -> list[Structure]:
     """Returns outputs of zero, and outputs that are affine in the features."""
     names = {False: "constant state", True: "least squares"}
@@ -248,6 +283,7 @@ def _affine_bases(
                 history=(0,) * len(kinematics.output_names),
             ),
             inputs,
+            reach,
             ranges,
         )
         for fitted, name in names.items()
@@ -262,12 +298,16 @@ def additions(structure: Structure) -> tuple[Addition, ...]:
         key="first_order_lags",
         words="first-order lags",
         extend=_with_lags(structure.inputs),
+        reach=LAG_ROWS,
     )
     if isinstance(structure.model.nominal, MultirotorNominal):
+        memories = _body_memories(structure.reach)
         alone = _alone_additions(structure.model)
-        return (*_MULTIROTOR_ADDITIONS, *_BODY_ADDITIONS, lags, *alone)
-    products = _product_additions(structure)
-    return (*_AFFINE_ADDITIONS, *_MEMORY_ADDITIONS, *products, lags, _REFINED)
+        possible = (*_MULTIROTOR_ADDITIONS, *memories, lags, *alone)
+    else:
+        products = _product_additions(structure)
+        possible = (*_AFFINE_ADDITIONS, *_MEMORY_ADDITIONS, *products, lags, _REFINED)
+    return tuple(one for one in possible if one.reach <= structure.reach)
 
 
 def _median_voltage(log: Log) -> float:
@@ -292,15 +332,24 @@ def _with_memory(memory: Memory) -> Callable[[LogModel], LogModel | None]:
 
 
 _MEMORY_ADDITIONS = tuple(
-    Addition(key, words, _with_memory(memory), for_control=False)
+    Addition(key, words, _with_memory(memory), False, memory.reach)
     for key, (words, memory) in _MEMORIES.items()
 )
 
 
-# Rows alone are enough of few signals, whose outputs have no physics.
-_BODY_ADDITIONS = tuple(
-    one for one in _MEMORY_ADDITIONS if one.key in ("rows_and_means", "rows8")
-)
+_REACHES = sorted({LAG_ROWS, *(one.reach for one in _MEMORY_ADDITIONS)})
+
+
+def _body_memories(reach: int) -> tuple[Addition, ...]:
+    """Returns the memories of a rigid body: rows with means, where these are filled.
+
+    Rows alone are enough of few signals, whose outputs have no physics.
+    """
+    keys = ("rows_and_means", "rows8")
+    memories = tuple(one for one in _MEMORY_ADDITIONS if one.key in keys)
+    if all(one.reach <= reach for one in memories):
+        return memories
+    return _MEMORY_ADDITIONS
 
 
 def _product_additions(structure: Structure) -> list[Addition]:

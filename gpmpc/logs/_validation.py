@@ -7,11 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from gpmpc.exceptions import DataError
-from gpmpc.logs._fitting import NominalFit
+from gpmpc.logs._fitting import PAST, NominalFit
 from gpmpc.logs._folds import Fold
-from gpmpc.logs._held_out_errors import PAST_ROWS
 from gpmpc.logs._log import Log
-from gpmpc.logs._noise import fit_noise
+from gpmpc.logs._noise import fit_noise, learning_gains
 from gpmpc.logs._rollout_corrections import (
     Averages,
     Rollouts,
@@ -24,6 +23,8 @@ from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel
 
 _CORRECTED_WINDOWS = 2400  # that a correction is fitted to
+#: of models of all rows, by those of three quarters and of halves
+_GAIN_EXPONENT = np.log(4 / 3) / np.log(3 / 2)
 _LARGEST = 1e6  # state of a rollout that a correction is fitted to
 
 
@@ -45,6 +46,7 @@ class Validations:
         log: All runs.
         folds: Of the log.
         fits: Of structures.
+        past: Rows that any of them needs before the start of a rollout.
         steps: Of the rollouts.
         judged_steps: Those at which corrections are fitted.
     """
@@ -54,12 +56,14 @@ class Validations:
         log: Log,
         folds: Sequence[Fold],
         fits: StructureFits,
+        past: int,
         steps: int,
         judged_steps: tuple[int, ...],
     ):
         self._log = log
         self._folds = folds
         self._fits = fits
+        self._past = past
         self._steps = steps
         self._judged_steps = judged_steps
         self._validations: dict[str, list[_Validation]] = {}
@@ -101,7 +105,18 @@ class Validations:
             others = [one.rollouts for one in validations if one is not validation]
             models.append(self._correct(validation.model, structure, others))
         held_out = [validation.held_out for validation in validations]
-        return fit_noise(models, held_out, self._steps)
+        noise = fit_noise(models, held_out, self._steps)
+        if len(validations) == len(self._folds):
+            return noise
+        of_halves = self.models(structure)
+        gains = learning_gains(
+            fewer=[of_halves[i // 2] for i in range(len(validations))],
+            models=models,
+            logs=held_out,
+            steps=noise.steps,
+            exponent=_GAIN_EXPONENT,
+        )
+        return replace(noise, scales=gains * noise.scales)
 
     def fit_to_all_runs(self, structure: Structure) -> NominalFit:
         """Fits a structure to all runs, its GPs and its correction as well."""
@@ -153,7 +168,7 @@ class Validations:
                     train=replace(fold.train, runs=others),
                     held_out=replace(fold.held_out, runs=runs[first::2]),
                 )
-                quarter.held_out.windows(self._steps, past=PAST_ROWS, most=1)
+                quarter.held_out.windows(self._steps, past=self._past, most=1)
                 quarters.append(quarter)
         return quarters
 
@@ -162,7 +177,7 @@ class Validations:
         share = len(held_out) / len(self._log)
         windows = held_out.windows(
             ahead=self._steps,
-            past=PAST_ROWS,
+            past=max(model.past, PAST),
             most=max(round(share * _CORRECTED_WINDOWS), 1),
         )
         with np.errstate(over="ignore", invalid="ignore"):

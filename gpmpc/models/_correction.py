@@ -97,13 +97,20 @@ class Correction:
         return replace(corrections[0], weights=averaged)
 
     def __call__(self, windows: Windows, predicted: Array) -> Array:
-        """Corrects rollouts (W, K, n); linear between its steps, constant after."""
+        """Corrects rollouts (W, K, n).
+
+        It is linear between its steps. After the last one it fades, to nothing at twice
+        as many steps: the past has said what it has to say.
+        """
         knots = [0]
         corrections = [np.zeros((len(windows), self.weights.shape[-1]))]
         for i, step in enumerate(self.steps):
             if step <= predicted.shape[1]:
                 knots.append(step)
                 corrections.append(self._at(i, windows, predicted[:, step - 1]))
+        if predicted.shape[1] > self.steps[-1]:
+            knots.append(2 * self.steps[-1])
+            corrections.append(np.zeros_like(corrections[0]))
         values = np.stack(corrections, axis=1)
         ahead = np.arange(1, predicted.shape[1] + 1)
         after = np.clip(np.searchsorted(knots, ahead), 1, len(knots) - 1)

@@ -27,8 +27,8 @@ from gpmpc.models._namings import NO_NAMINGS, Namings
 from gpmpc.models._past import states_along
 from gpmpc.signals import UNKNOWN, Signals
 
-#: of the coloured noise of outputs [s]; zero is white
-TIME_CONSTANTS = (0.0, 0.05, 0.25, 1.0)
+#: of the coloured noise of outputs [rows]; zero is white
+TIME_CONSTANTS = (0.0, 5.0, 25.0, 100.0)
 _NO_CONTEXT = np.empty(0)
 
 
@@ -36,13 +36,15 @@ _NO_CONTEXT = np.empty(0)
 class OutputNoise:
     """Variances of the sources of the errors of a model of outputs."""
 
-    #: of each of ``TIME_CONSTANTS`` and output (T, o), in squared units of the outputs
+    #: of each time constant and output (T, o), in squared units of the outputs
     outputs: Array
     measurement: Array  #: of each entry of a difference of states (e,), likewise
     #: steps ahead at which ``scales`` stand (S,), increasing; none without
     steps: tuple[int, ...] = ()
     #: squared errors of held-out predictions over what the sources explain (S, e)
     scales: Array = field(default_factory=lambda: np.empty((0, 0)))
+    #: of the outputs' noise [rows] (T,); zero is white
+    time_constants: tuple[float, ...] = TIME_CONSTANTS
 
     def scales_at(self, steps: Sequence[int]) -> Array:
         """Returns factors (steps, e) of the variances that the sources explain.

@@ -31,7 +31,7 @@ from gpmpc.models._roll_out import iterate
 from gpmpc.models._windows import Windows
 
 DIVERGED = 1e9  # error of a rollout that is not finite
-_LAG_ROWS = 40  # from which the state of first-order lags is known
+LAG_ROWS = 40  # from which the state of first-order lags is known
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class LogModel:
     @property
     def past(self) -> int:
         """Number of rows that a prediction needs before its start."""
-        lag_rows = _LAG_ROWS if len(self.time_constants) else 0
+        lag_rows = LAG_ROWS if len(self.time_constants) else 0
         rows = max(*self.history, self.memory.reach, lag_rows) + self.lag
         if self.correction is None and self.start_filter is None:
             return rows

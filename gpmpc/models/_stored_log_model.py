@@ -30,7 +30,7 @@ from gpmpc.gp._storage import (
 from gpmpc.models._correction import BINS, LAGS, Correction, StartFilter
 from gpmpc.models._grouped import GroupedNominal
 from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
-from gpmpc.models._log_dynamics import TIME_CONSTANTS, LogDynamics, OutputNoise
+from gpmpc.models._log_dynamics import LogDynamics, OutputNoise
 from gpmpc.models._log_model import LogModel, OutputGP
 from gpmpc.models._memory import NO_MEMORY, Memory, Products
 from gpmpc.models._namings import NO_NAMINGS, Namings
@@ -51,6 +51,7 @@ _GROUPED_NAME = "GroupedNominal"
 _SYSTEM_NAME = "SystemNominal"
 _REGRESSION_TENSORS = ("mean", "deviation", "weights")
 _KINDS_OF_GROUPS = ("vector", "angle", "quaternion")
+_OLDER_TIME_CONSTANTS = (0.0, 0.05, 0.25, 1.0)  # of noise [s], of files without them
 _LONGEST = 10_000  # rows that a model from a file looks back
 _SLOWEST = 1e9  # time step of a model from a file [s]
 _MOST = 2048  # states, inputs or context of a model from a file
@@ -101,6 +102,7 @@ def log_model_parts(
         "history": model.history,
         "lag": model.lag,
         "noise_steps": named.noise.steps,
+        "noise_rows": named.noise.time_constants,
         "gps": gps,
         "names": [named.state_names, named.input_names, named.context_names],
         "time_step": named.time_step,
@@ -119,6 +121,13 @@ def log_model_parts(
         header["without_nominal"] = model.without_nominal
         tensors["weights"] = torch.from_numpy(model.weights)
     return header, tensors
+
+
+def _noise_rows(header: Mapping[str, Any]) -> tuple[float, ...]:
+    """Returns the time constants of the noise of outputs [rows]."""
+    if "noise_rows" in header:
+        return tuple(header["noise_rows"])
+    return tuple(constant / header["time_step"] for constant in _OLDER_TIME_CONSTANTS)
 
 
 def _regressions(model: LogModel) -> dict[str, Correction | StartFilter]:
@@ -214,6 +223,7 @@ def log_model_of_parts(
     noise = OutputNoise(
         outputs=tensors["noise/outputs"].numpy(),
         measurement=tensors["noise/measurement"].numpy(),
+        time_constants=_noise_rows(header),
     )
     if header.get("noise_steps"):  # older files have none
         noise = replace(
@@ -613,7 +623,9 @@ def _check_rows(key: str, rows: Any) -> None:
 def _check_noise(noise: OutputNoise, kinematics: Kinematics) -> None:
     """Raises ``DataError`` unless the noise is that of a model with kinematics."""
     outputs = len(kinematics.output_names)
-    check_shape("noise/outputs", noise.outputs, (len(TIME_CONSTANTS), outputs))
+    for rows in noise.time_constants:
+        check_number("noise_rows", rows, least=0, unit="[rows]")
+    check_shape("noise/outputs", noise.outputs, (len(noise.time_constants), outputs))
     check_shape("noise/measurement", noise.measurement, (kinematics.space.error_dim,))
     if not all(np.isfinite(a).all() for a in (noise.outputs, noise.measurement)):
         raise DataError("noise must be finite")

@@ -362,6 +362,22 @@ def test_scales_of_a_noise_lie_between_their_steps():
     np.testing.assert_array_equal(without.scales_at((1, 10)), np.ones((2, 2)))
 
 
+def test_noise_is_of_rows_whatever_the_time_step(flights):
+    log = as_log(flights[:1])
+    kinematics = Increments(log.space)
+    still = AffineNominal(kinematics, fitted=False)
+    model = LogModel(kinematics, still, np.empty(0), (0,) * 12)
+    windows = log.windows(20, 20, 300)
+    variances = []
+    for step in (0.01, 1e-6, 4.0):
+        noise = OutputNoise(np.ones((4, 12)) / step**2, np.ones(12))
+        cut = replace(windows, time_step=step)
+        variances.append(error_variances(model, cut, noise, (1, 20)))
+        np.testing.assert_allclose(variances[-1], variances[0], rtol=1e-3)
+    white = replace(noise, time_constants=(0.0,) * 4)
+    assert (error_variances(model, cut, white, (1, 20)) < variances[0])[:, 1].all()
+
+
 def test_chosen_rows_cover_what_is_rare():
     rng = np.random.default_rng(0)
     frequent = rng.normal(0, 0.01, (3000, 2))

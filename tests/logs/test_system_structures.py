@@ -101,7 +101,7 @@ def log_of(folder, table, mapping):
 
 def fitted_values(log, steps=15):
     """The fitted parameters of the first structure, and the structure."""
-    structure = bases(log)[0]
+    structure = bases(log, 40)[0]
     fit = fit_nominal(structure.model, None, log, steps)
     return {name: value for name, value, _ in fit.to_rows()}, structure
 
@@ -155,7 +155,7 @@ def test_a_dynamic_bicycle_predicts_what_its_tyres_do(tmp_path):
         },
     }
     log = log_of(tmp_path, table, mapping)
-    structure = bases(log)[0]
+    structure = bases(log, 40)[0]
     fit = fit_nominal(structure.model, None, log, steps=8)
     windows = log.windows(15, past=0, most=30)
     errors = fit.model.rollout_errors(windows, [15])
@@ -199,7 +199,7 @@ def test_a_differential_drive_is_found_by_speeds_or_by_wheels(tmp_path, wheels):
 def test_a_log_that_is_no_bicycles_is_refused(tmp_path, change, text):
     table = flight(kinematic_bicycle(), excitation(50, (0, 0.1), (0, 0.1)))
     with pytest.raises(SettingError, match=text):
-        bases(log_of(tmp_path, table, {**CAR, **change}))
+        bases(log_of(tmp_path, table, {**CAR, **change}), 40)
 
 
 ARM = '''
@@ -326,7 +326,7 @@ def test_values_that_a_system_refuses_beyond_a_bound_are_not_tried(arm):
     length = {"start": 0.95, "low": 0.5, "high": 0.95}
     entry = {"system": "my_robot:Capped", "parameters": {"length": length, "mass": 1}}
     log = read_log(arm / "log.csv", {**PENDULUM, "nominal": entry})
-    fit = fit_nominal(bases(log)[0].model, None, log, 5)
+    fit = fit_nominal(bases(log, 40)[0].model, None, log, 5)
     assert fit.model.theta[0] == pytest.approx(0.95, abs=1e-3)
     assert (fit.standard_errors > 1e-4).all()  # tiny ones of derivatives across it
     for length in (0.96, 0.4, np.nan):
@@ -383,12 +383,12 @@ def test_what_names_no_system_is_refused(nominal, text):
 def test_a_system_that_does_not_fit_is_refused(arm, nominal, text):
     log = read_log(arm / "log.csv", {**PENDULUM, "nominal": nominal})
     with pytest.raises(SettingError, match=text):
-        bases(log)
+        bases(log, 40)
 
 
 def test_a_file_names_the_users_code_and_reads_it_only_where_it_is_trusted(arm):
     log = read_log(arm / "log.csv", {**PENDULUM, "nominal": "my_robot:Arm"})
-    fit = fit_nominal(bases(log)[0].model, None, log, steps=5)
+    fit = fit_nominal(bases(log, 40)[0].model, None, log, steps=5)
     noise = OutputNoise(np.ones((4, 2)), np.ones(2))
     names = (log.space.names, log.input_names, ())
     path = arm / "model.safetensors"
@@ -415,7 +415,7 @@ def saved_start(folder, states, inputs):
     table = pandas.read_csv(folder / "log.csv")
     table = table.assign(**{new: table[old] for new, old in columns.items()})
     log = log_of(folder, table, {**mapping, "nominal": "gpmpc.systems:pendulum"})
-    model = bases(log)[0].model
+    model = bases(log, 40)[0].model
     model = replace(model, theta=model.nominal.start)
     noise = OutputNoise(np.ones((4, 2)), np.ones(2))
     names = [log.mapping.column_names(role) for role in ("states", "inputs")]
@@ -561,4 +561,4 @@ def test_the_pages_systems_are_fitted_by_its_mappings(tmp_path, monkeypatch):
         nominal = {"system": "my_rod:make_rod", "fixed": {"folder": str(tmp_path)}}
         slow = table.assign(time=0.02 * np.arange(200))
         log = log_of(tmp_path, slow, {**mapping, "nominal": nominal})
-        assert bases(log)[0].name == "make_rod"
+        assert bases(log, 40)[0].name == "make_rod"
