@@ -140,8 +140,8 @@ def available_chip() -> ChipName:
 def measure_footprint(
     controller: GPMPC,
     questions: Sequence[Question] = (),
-    chip: ChipName = "cortex-m4f",
-    precision: Precision = "float",
+    chip: ChipName | None = None,
+    precision: Precision = "double",
     on_failure: str = "previous_plan",
     estimator: Estimator | None = None,
 ) -> Footprint:
@@ -150,9 +150,10 @@ def measure_footprint(
     Args:
         controller: What is exported.
         questions: Of a flight, step by step: they are replayed in QEMU, where it is
-            installed. without any, none are counted.
+            installed, and instructions are counted.
         chip: ``"cortex-m4f"`` and ``"cortex-m7"`` by ``arm-none-eabi-gcc``, ``"host"``
-            by ``cc``.
+            by ``cc``. By default the first where there is a compiler for it, else the
+            last.
         precision: See ``export_c``.
         on_failure: See ``export_c``.
         estimator: See ``export_c``; questions hold what sensors show then.
@@ -160,6 +161,7 @@ def measure_footprint(
     Raises:
         SettingError: The controller cannot be exported, or there is no compiler.
     """
+    chip = available_chip() if chip is None else chip
     check_chip(chip)
     with tempfile.TemporaryDirectory() as name:
         build = _Build(Path(name), _CHIPS[chip])

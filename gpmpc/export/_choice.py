@@ -24,9 +24,11 @@ from gpmpc.export._chip import (
     check_counts_instructions,
     measure_footprint,
 )
-from gpmpc.export._points import informative_order, posterior_of, with_points
+from gpmpc.export._filter import Estimator
+from gpmpc.export._points import informative_order, posterior_of
 from gpmpc.export._price import Fly, cost_of, flight_of, ratio_of_errors
 from gpmpc.export._text import Precision
+from gpmpc.export._write import reduce_points
 from gpmpc.mpc import GPMPC
 
 # of neighbouring counts in the table
@@ -106,7 +108,8 @@ class PointRow(NamedTuple):
     points: int
     footprint: Footprint
     error: float  #: one-step error along the flight, all points 1
-    cost: float  #: of the flight, all points 1; infinite where it came to no end
+    #: tracking cost of the flight, all points 1; infinite where it came to no end
+    cost: float
 
 
 @dataclass(frozen=True)
@@ -153,6 +156,7 @@ def choose_points(
     chip: ChipName | None = None,
     precision: Precision = "double",
     on_failure: str = "previous_plan",
+    estimator: Estimator | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> PointChoice:
     """Finds the largest number of points whose exported code fits a budget.
@@ -171,6 +175,8 @@ def choose_points(
             compiler for it, else ``"host"``.
         precision: See ``export_c``.
         on_failure: See ``export_c``.
+        estimator: See ``export_c``. Its filter takes flash and RAM; instructions are
+            not counted with one, since a flight does not say what its sensors showed.
         progress: Called with a line before each part of the work.
 
     Returns:
@@ -196,6 +202,7 @@ def choose_points(
         chip=chip,
         precision=precision,
         on_failure=on_failure,
+        estimator=estimator,
         progress=progress or _ignore,
     )
     return search.run()
@@ -212,6 +219,7 @@ class _Search:
         chip: ChipName,
         precision: Precision,
         on_failure: str,
+        estimator: Estimator | None,
         progress: Callable[[str], None],
     ):
         self._controller = controller
@@ -221,12 +229,16 @@ class _Search:
         self._chip: ChipName = chip
         self._precision: Precision = precision
         self._on_failure = on_failure
+        self._estimator = estimator
         self._progress = progress
         self._footprints: dict[int, Footprint] = {}
         self._size = len(posterior_of(self._model))
         self._informative = len(informative_order(self._model))
         if budget.instructions is not None:
             check_counts_instructions(chip)
+            if estimator is not None:
+                rule = "instructions are counted without an estimator; limit the others"
+                raise SettingError("budget", rule)
 
     def run(self) -> PointChoice:
         """Returns the choice."""
@@ -279,18 +291,21 @@ class _Search:
         """Returns what the code of so many points takes."""
         if count not in self._footprints:
             self._progress(f"compiling {count} points")
+            controller, estimator = self._reduced(count)
+            questions = [] if estimator else self._flight.questions[:_REPLAYED]
             self._footprints[count] = measure_footprint(
-                self._reduced(count),
-                self._flight.questions[:_REPLAYED],
+                controller,
+                questions,
                 chip=self._chip,
                 precision=self._precision,
                 on_failure=self._on_failure,
+                estimator=estimator,
             )
         return self._footprints[count]
 
-    def _reduced(self, count: int) -> GPMPC:
-        """Returns the controller of so many points."""
-        return self._controller.with_model(with_points(self._model, count))
+    def _reduced(self, count: int) -> tuple[GPMPC, Estimator | None]:
+        """Returns controller and filter of so many points."""
+        return reduce_points(self._controller, self._estimator, count)
 
     def _row(self, count: int) -> PointRow:
         """Returns the row of so many points, which are flown."""
@@ -298,7 +313,7 @@ class _Search:
         if count == self._size:
             return PointRow(count, footprint, error=1.0, cost=1.0)
         self._progress(f"flying {count} points")
-        reduced = self._reduced(count)
+        reduced, _ = self._reduced(count)
         error = ratio_of_errors(reduced.prediction.model, self._model, self._flight)
         cost = cost_of(self._fly, reduced)
         return PointRow(count, footprint, error, _ratio(cost, self._flight.cost))

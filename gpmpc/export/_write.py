@@ -76,7 +76,7 @@ def export_c(
     if points is not None:
         check_exportable(controller, on_failure)
         model = controller.prediction.model
-        controller, estimator = _with_points(controller, estimator, points)
+        controller, estimator = reduce_points(controller, estimator, points)
         notes.append(_note_of_points(controller.prediction.model, model))
     export = write_code(
         controller, folder / "src", precision, on_failure, estimator, notes
@@ -87,7 +87,7 @@ def export_c(
     return export
 
 
-def _with_points(
+def reduce_points(
     controller: GPMPC, estimator: Estimator | None, points: int
 ) -> tuple[GPMPC, Estimator | None]:
     """Returns controller and filter of fewer points.

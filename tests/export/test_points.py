@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 import torch
 
+from gpmpc.estimation import KalmanFilter, Measurement
 from gpmpc.exceptions import Diverged, SettingError
 from gpmpc.export import (
     Budget,
+    Estimator,
     Footprint,
     Question,
     choose_points,
@@ -138,6 +140,22 @@ def test_the_header_says_how_many_points_are_kept(tmp_path):
     assert "points: 12 of the 40 of the model" in header
     assert "#define GPMPC_POINTS 12 " in header
     assert "points:" not in export_c(pendulum(), tmp_path).header.read_text()
+
+
+def filtered_pendulum():
+    controller = pendulum()
+    kalman = KalmanFilter.extended(GP, Measurement.of_states(2, [0], [0.05]))
+    start = Gaussian(torch.zeros(2), torch.eye(2))
+    return controller, Estimator(kalman, start)
+
+
+def test_a_filter_of_the_same_model_gets_as_few_points(tmp_path):
+    controller, estimator = filtered_pendulum()
+    export = export_c(controller, tmp_path, estimator=estimator, points=12)
+    source = export.source.read_text()
+    assert "over N = 12 points" in source
+    assert "over N = 40 points" not in source
+    assert "#define filter_model model" in source
 
 
 def test_budgets_are_read():
@@ -270,6 +288,7 @@ def known():
         ("fly", {"fly": lambda controller: fly(pendulum())}),
         ("budget", {"budget": "flash=64kB"}),
         ("budget", {"budget": Budget(instructions=1e6), "chip": "host"}),
+        ("estimator", {"estimator": GP}),
         ("chip", {"chip": "avr"}),
         ("precision", {"precision": "half"}),
     ],
@@ -303,7 +322,9 @@ def test_a_chip_decides_as_python():
     origin = Reference(np.zeros(2))
     questions = [Question(state, origin) for state in flown.measured]
     footprints = [
-        measure_footprint(pendulum(with_points(GP, points)), questions)
+        measure_footprint(
+            pendulum(with_points(GP, points)), questions, "cortex-m4f", "float"
+        )
         for points in (40, 12)
     ]
     all_points, fewer = footprints
