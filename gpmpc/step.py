@@ -28,7 +28,8 @@ class Step:
     # what the controller decided, with its plan, status, timing and quadratic program;
     # None where it was not called, or returned inputs of another shape
     decision: "Decision | None"
-    # measured minus predicted one step ago (n,); NaN at the first step
+    # measured minus predicted one step ago (n,); NaN at the first step, after one whose
+    # decision was not applied, and where nothing was measured
     innovation: np.ndarray
     # covariance of the belief of the state (n, n); zero with a plant in the loop
     belief_covariance: np.ndarray

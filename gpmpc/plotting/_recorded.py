@@ -75,7 +75,7 @@ class _Tracked(NamedTuple):
     unit: str
     gaps: np.ndarray  # rows before which steps are lost
     jumps: np.ndarray  # rows at which its reference moves by a full turn
-    state: np.ndarray  # (K,) as it was flown
+    values: np.ndarray  # (K,) as they were flown
     reference: np.ndarray  # (K,)
     expected: np.ndarray  # (K,) mean that was predicted one step before
     expected_std: np.ndarray  # (K,)
@@ -147,12 +147,12 @@ def _tracked_states(run: "Run") -> list[_Tracked]:
     means, stds = expected(run, indices)
     tracked_states = []
     for column, (name, index) in enumerate(zip(names, indices, strict=True)):
-        state = run.states[:, index]
+        values = run.states[:, index]
         reference = run.references[:, index]
         mean = means[:, column]
         if name in angles:
-            reference = reference + whole_turns(state - reference)
-            mean = mean + whole_turns(state - mean)
+            reference = reference + whole_turns(values - reference)
+            mean = mean + whole_turns(values - mean)
         unit = units.get(f"state.{name}", "")
         tracked_states.append(
             _Tracked(
@@ -160,7 +160,7 @@ def _tracked_states(run: "Run") -> list[_Tracked]:
                 unit=unit,
                 gaps=_gaps(run),
                 jumps=_jumps(reference) if name in angles else np.empty(0, int),
-                state=state,
+                values=values,
                 reference=reference,
                 expected=mean,
                 expected_std=stds[:, column],
@@ -172,7 +172,7 @@ def _tracked_states(run: "Run") -> list[_Tracked]:
 def _draw_path(axis: Axes, times: np.ndarray, state: _Tracked) -> None:
     """Draws a state over time against its reference."""
     axis.plot(
-        *_broken(times, state.state, state.gaps),
+        *_broken(times, state.values, state.gaps),
         color=FLOWN,
         linewidth=1.6,
         label="flown",
@@ -190,7 +190,7 @@ def _draw_path(axis: Axes, times: np.ndarray, state: _Tracked) -> None:
 def _draw_error(axis: Axes, times: np.ndarray, state: _Tracked) -> None:
     """Draws how far a state is from its reference over time."""
     axis.axhline(0, color=REFERENCE, linewidth=1, linestyle=DASHED)
-    error = state.state - state.reference
+    error = state.values - state.reference
     axis.plot(*_broken(times, error, state.breaks), color=FLOWN, linewidth=1.2)
 
 
@@ -207,7 +207,7 @@ def _draw_prediction_error(
         linewidth=0,
         label=tube,
     )
-    axis.plot(times, state.state - state.expected, color=FLOWN, linewidth=1.0)
+    axis.plot(times, state.values - state.expected, color=FLOWN, linewidth=1.0)
 
 
 def _gaps(run: "Run") -> np.ndarray:

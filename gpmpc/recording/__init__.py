@@ -9,10 +9,14 @@ file.
 
 To record one more number of a step, add
 
-1. a field with a new number to ``message Step`` in ``_schema.PROTO``,
-2. its value to ``Encoder._step_message`` in ``_encoding``,
-3. an attribute to ``Run``, with its column in ``Run.columns``, in ``_run``,
-4. the line that reads it to ``_make_run`` in ``_read_run``.
+1. the number to ``gpmpc.step.Step``, unless its decision has it, and where it is known
+   to ``Flight.add`` in ``gpmpc.simulation._flight``,
+2. a field with a new number to ``message Step`` in ``_schema.PROTO``,
+3. its value to ``Encoder._step_message`` in ``_encoding``,
+4. its unit to ``RecordedSystem.field_units`` in ``_system``, unless it is a ``State``,
+   an ``Input`` or a ``Timing``, whose units are there, and to docs/recording.md,
+5. an attribute to ``Run``, with its column in ``Run.columns``, in ``_run``,
+6. the line that reads it to ``_make_run`` in ``_read_run``.
 
 To record one more topic, add a message to ``_schema.PROTO`` and its topic to
 ``TOPICS``, yield it in ``Encoder.encode``, and read it in

@@ -29,7 +29,8 @@ RESIDUALS = ("primal", "dual", "gap")  # columns of ``Run.residuals``
 class Run:
     """K recorded steps with n states and m inputs.
 
-    Plans have the longest horizon H, with NaN beyond a shorter one.
+    Plans have the longest horizon H. They are NaN beyond a shorter one, and at steps
+    that have none: where nothing was decided, or the plan is lost.
     """
 
     path: Path
@@ -45,7 +46,9 @@ class Run:
     measured: Array  # (K, n)
     inputs: Array  # (K, m) applied inputs
     input_bounds: Array  # (2, m) lower and upper; infinite where none were given
-    innovations: Array  # (K, n)
+    # (K, n) measured minus predicted one step ago; NaN where nothing was predicted, at
+    # the first step or after one that failed, and where nothing was measured
+    innovations: Array
     belief_covariances: Array  # (K, n, n)
     plan_inputs: Array  # (K, H, m)
     plan_means: Array  # (K, H + 1, n)
@@ -110,7 +113,8 @@ class Run:
 
         They are NaN where there is no solution.
         """
-        return np.array([residuals(self.problems.get(k)) for k in self.steps.tolist()])
+        by_step = [residuals(self.problems.get(k)) for k in self.steps.tolist()]
+        return np.reshape(by_step, (-1, len(RESIDUALS)))
 
     @cached_property
     def columns(self) -> dict[str, Array]:
@@ -130,7 +134,7 @@ class Run:
             "iterations": self.iterations,
             "active_set_size": self.active_set_sizes,
             **_columns("timing", TIMINGS, self.timings),
-            **_columns("residuals", RESIDUALS, self.residuals.reshape(-1, 3)),
+            **_columns("residuals", RESIDUALS, self.residuals),
             "gp_size": self.gp_sizes,
             "gp_version": self.gp_versions,
             "failed": self.failed,

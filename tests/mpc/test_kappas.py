@@ -12,6 +12,7 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
+from gpmpc.simulation import ModelLoop, closed_loop
 from tests.mpc.small_models import double_integrator
 
 H = 6
@@ -51,6 +52,23 @@ def test_bounds_are_moved_by_the_kappas_of_the_reference():
         assert np.allclose(decision.inputs, plain.inputs, atol=1e-9) == (
             kappas[0] == kappas[-1]
         )
+
+
+def test_the_steps_of_a_closed_loop_keep_to_their_own_kappas():
+    steps = 6
+    rising = np.where(np.arange(steps + H) < 4, 4.0, 8.0)
+    path = Reference(
+        np.tile([1.0, 0.0], (steps + H + 1, 1)), np.zeros((steps + H, 1)), rising
+    )
+    point = Reference([1.0, 0.0], [0.0], np.full(H, 4.0))
+    system = ModelLoop(double_integrator(), Linearization(), 0.1)
+    at_bound = []
+    for reference in (path, point):
+        flight = closed_loop(system, controller(), reference, START, steps)
+        at_bound.append(flight.states[1:, 0])
+    # As near as 4 deviations of the next state, and 8 from the fourth step on.
+    assert np.allclose(at_bound[0], [0.26] * 4 + [0.22] * 2, atol=1e-6)
+    assert np.allclose(at_bound[1], 0.26, atol=1e-6)
 
 
 def test_a_set_point_keeps_its_kappas():
