@@ -1,28 +1,30 @@
 """Holds exported controllers to the decisions of Python, question by question.
 
     .venv/bin/python -m benchmarks.export [--questions 20000] [--cases quadrotor-10 ..]
-                                          [--precisions double float] [--sanitize]
+                                          [--precisions double float] [--check]
 
-Six controllers fly in closed loops of Python: the quadrotor of the paper with a
+Seven controllers fly in closed loops of Python: the quadrotor of the paper with a
 horizon of 10 and of 20 (chance constraints of its position), a learned cart-pole that
 must keep to its rail, the MuJoCo quadrotor whose residual is learned on a rigid body,
-the learned pole whose input acts three steps late, and the stirred tank. Every question
-of these flights (belief, reference, last decision) goes to the compiled C as well, in
-double and in float. Every flight has a seed, of its noise and of what disturbs its
-start, its reference or its wind.
-With ``--sanitize`` every question goes to a build with clang's sanitizers of addresses
-and undefined behaviour as well, which end the process at a fault. Their runtime has to
-be preloaded (``LD_PRELOAD=$(clang -print-file-name=libclang_rt.asan-x86_64.so)
-ASAN_OPTIONS=detect_leaks=0``), and before it a ``dlopen`` that drops the flag
-``RTLD_DEEPBIND``, with which CasADi opens its plugins.
+the learned pole whose input acts three steps late, four levels of a quadruple tank, and
+a stirred tank whose reaction may run away. Every question of these flights (belief,
+reference, last decision) goes to the compiled C as well, in double and in float. Every
+flight has a seed, of its noise and of what disturbs its start, its reference or its
+wind.
+With ``--check`` a build with clang's sanitizers of addresses and undefined behaviour
+answers every question as well, and the source is compiled strictly by gcc, linted by
+cppcheck, and held to libm alone (``benchmarks.export_checks``); a fault ends the run.
 Printed for each: questions, the largest difference of an input, as a share of the
 input's range in brackets, other statuses, and the median time of a step of Python and
 of C alone [ms]. Writes ``outputs/benchmarks/export.json``.
 """
 
 import argparse
+import runpy
+import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from time import perf_counter
 from typing import Any, NamedTuple
 
@@ -30,6 +32,7 @@ import numpy as np
 import torch
 
 from benchmarks import delayed_pole, quadrotor
+from benchmarks.export_checks import CheckedController
 from benchmarks.timing import use_one_thread, write_results
 from gpmpc.export import CompiledController
 from gpmpc.gaussian import Gaussian
@@ -52,14 +55,6 @@ from gpmpc.trajectories import states_along
 Array = np.ndarray
 # of a flight, after which the next seed flies
 STEPS = 250
-SANITIZED = (
-    "clang",
-    "-O1",
-    "-g",
-    "-fsanitize=address,undefined",
-    "-fno-sanitize-recover=all",
-    "-shared-libasan",
-)
 
 
 class Case(NamedTuple):
@@ -81,24 +76,20 @@ class Comparison:
     """
 
     def __init__(
-        self, controller: GPMPC, precisions: Sequence[Any], sanitize: bool = False
+        self, controller: GPMPC, precisions: Sequence[Any], check: bool = False
     ):
         self.horizon = controller.horizon
         self.problem = controller.problem
         self.initial_input = controller.initial_input
         self._controller = controller
+        compiled = CheckedController if check else CompiledController
         self.inputs: list[Array] = []
         self.statuses: Counter[str] = Counter()
         self.python_seconds: list[float] = []
         self.answers = {
-            precision: CompiledAnswers(CompiledController(controller, precision))
+            precision: CompiledAnswers(compiled(controller, precision))
             for precision in precisions
         }
-        self._sanitized = [
-            CompiledController(controller, precision, compiler=SANITIZED)
-            for precision in precisions
-            if sanitize
-        ]
 
     @property
     def signals(self):
@@ -114,8 +105,6 @@ class Comparison:
         self.inputs.append(decision.input)
         for answers in self.answers.values():
             answers.compare(decision, belief, reference, previous)
-        for compiled in self._sanitized:
-            compiled.control(belief, reference, previous)
         return decision
 
 
@@ -142,6 +131,22 @@ class CompiledAnswers:
         if compiled.status is not decision.status:
             names = f"{decision.status.name}, {compiled.status.name}"
             self.other_statuses[names] += 1
+
+    def checked(self) -> dict[str, Any]:
+        """Returns what sanitised code answered, where it was asked.
+
+        Raises:
+            RuntimeError: A sanitizer found a fault.
+        """
+        if not isinstance(self._compiled, CheckedController):
+            return {}
+        questions, largest, other_statuses = self._compiled.replay.finish()
+        return {
+            "sanitized_questions": questions,
+            "sanitized_largest": largest,
+            "sanitized_other_statuses": other_statuses,
+            "needed": self._compiled.replay.needed,
+        }
 
 
 def paper_quadrotor(horizon: int) -> Case:
@@ -219,7 +224,7 @@ def learned_cart_pole() -> Case:
     return Case(controller, fly)
 
 
-def tank() -> Case:
+def reactor() -> Case:
     """The reactor at its unstable operating point, its temperature kept below."""
     plant = stirred_tank()
     rng = np.random.default_rng(0)
@@ -260,6 +265,49 @@ def tank() -> Case:
             goal + offset,
             STEPS,
             noise=Noise(measurement=[1e-3, 0.1]),
+            seed=seed,
+            on_failure="previous_plan",
+        )
+
+    return Case(controller, fly)
+
+
+def quadruple_tank() -> Case:
+    """Four levels by two pumps: the lower ones go from set point to set point."""
+    script = Path(__file__).with_name("robots") / "tank.py"
+    sys.argv = [str(script), "0"]  # the seed of its data
+    learned = runpy.run_path(str(script))
+    plant = learned["plant"]
+    problem = Problem(
+        Tracking([1.0, 1.0, 0.0, 0.0], [0.1, 0.1]),
+        inputs=Box(plant.input_lower, plant.input_upper),
+        constraints=[Box(upper=[18.0, 18.0, np.inf, np.inf], probability=0.95)],
+    )
+    settings = PredictionSettings(disturbance_gain=0.3)
+    controller = GPMPC(
+        learned["model"],
+        Linearization(),
+        problem,
+        20,
+        plant.initial_input,
+        settings,
+        iterations=1,
+    )
+    goal = np.asarray(plant.goal, dtype=float)
+    start = np.asarray(plant.start, dtype=float)
+
+    def fly(flown: Any, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        references = np.tile(goal, (STEPS + controller.horizon + 1, 1))
+        for first in range(0, len(references), 60):
+            references[first:, :2] = rng.uniform(8.0, 17.5, 2)
+        closed_loop(
+            plant,
+            flown,
+            references,
+            start * rng.uniform(0.7, 1.3, 4),
+            STEPS,
+            noise=Noise(measurement=[0.01] * 4),
             seed=seed,
             on_failure="previous_plan",
         )
@@ -367,7 +415,8 @@ CASES: dict[str, Callable[[], Case]] = {
     "cart-pole": learned_cart_pole,
     "mujoco-quadrotor": mujoco_quadrotor,
     "delayed-pole": late_pole,
-    "tank": tank,
+    "stirred-tank": reactor,
+    "quadruple-tank": quadruple_tank,
 }
 
 
@@ -376,10 +425,10 @@ def compare(
     case: Case,
     questions: int,
     precisions: Sequence[Any],
-    sanitize: bool = False,
+    check: bool = False,
 ) -> list[dict[str, Any]]:
     """Asks all of them a number of questions; returns a row for each precision."""
-    comparison = Comparison(case.controller, precisions, sanitize)
+    comparison = Comparison(case.controller, precisions, check)
     seed = 0
     while len(comparison.inputs) < questions:
         case.fly(comparison, seed)
@@ -403,6 +452,7 @@ def compare(
                 "statuses": dict(comparison.statuses),
                 "python_ms": 1e3 * float(np.median(comparison.python_seconds)),
                 "c_ms": 1e3 * float(np.median(answers.seconds)),
+                **answers.checked(),
             }
         )
     return rows
@@ -414,7 +464,7 @@ def main() -> None:
     parser.add_argument("--questions", type=int, default=20_000)
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument("--precisions", nargs="+", default=["double", "float"])
-    parser.add_argument("--sanitize", action="store_true")
+    parser.add_argument("--check", action="store_true")
     arguments = parser.parse_args()
     use_one_thread()
     table = []
@@ -424,7 +474,7 @@ def main() -> None:
             CASES[name](),
             arguments.questions,
             arguments.precisions,
-            arguments.sanitize,
+            arguments.check,
         )
         table += rows
         for row in rows:
@@ -435,6 +485,14 @@ def main() -> None:
                 f"{row['python_ms']:.3f} {row['c_ms']:.3f}",
                 flush=True,
             )
+            if arguments.check:
+                print(
+                    f"    sanitised: {row['sanitized_questions']} answers, "
+                    f"{row['sanitized_largest']:.2g} from the first build, "
+                    f"{row['sanitized_other_statuses']} other statuses; "
+                    f"needs {', '.join(row['needed'])}",
+                    flush=True,
+                )
     write_results("export", table)
 
 

@@ -210,16 +210,19 @@ class CompiledController:
         parameters: Any = None,
     ) -> Decision:
         """Decides the input for one step; see ``GPMPC.control``."""
-        library = self._library
         fields = self._struct.fields
-        library.reset(self._struct)
+        self._library.reset(self._struct)
         if previous is not None:
             _continue(fields, previous)
-        followed = library.reference(reference, parameters)
+        followed = self._library.reference(reference, parameters)
         began = perf_counter()
-        input = library.step(self._struct, belief, followed)
+        input = self._step(belief, followed)
         timing = Timing(solve=perf_counter() - began)
         return _decision(fields, input, timing)
+
+    def _step(self, belief: Gaussian, reference: Any) -> Array:
+        """Decides the input (m,) from what the code keeps."""
+        return self._library.step(self._struct, belief, reference)
 
 
 def compiled_controller(

@@ -332,12 +332,28 @@ static void write_offset(gpmpc_problem *problem, int k, int i, real after,
 #endif
 }
 
-/* Linearises the dynamics along the plan: c = f(s, u) + d - A s - B u. */
-static void linearize(gpmpc_controller *controller)
+/* Whether a plan may lead from a state to ``after`` where the model leads to ``next``:
+   not where these are further apart than the data are wide, twice. */
+static int is_motion(real next, real after, int i)
+{
+#if GPMPC_KNOWS_RANGES
+    return !(absolute(next - after) > 2 * data_ranges[i]);
+#else
+    (void)next;
+    (void)after;
+    (void)i;
+    return 1;
+#endif
+}
+
+/* Linearises the dynamics along the plan: c = f(s, u) + d - A s - B u. Returns whether
+   the plan is a motion, nearly; one stage that is held always is. */
+static int linearize(gpmpc_controller *controller)
 {
     gpmpc_problem *problem = &controller->problem;
     gpmpc_work *work = &problem->work;
     real next[GPMPC_STATES];
+    int moves = 1;
     int k, i;
     for (k = 0; k < GPMPC_STAGES; k++) {
         const real *s = problem->states[k];
@@ -349,6 +365,8 @@ static void linearize(gpmpc_controller *controller)
         for (i = 0; i < n; i++) {
             real after = next[i] + (GPMPC_ESTIMATES ? controller->disturbance[i] : 0);
             write_offset(problem, k, i, after, s, u);
+            if (!GPMPC_HELD)
+                moves = moves && is_motion(after, problem->states[k + 1][i], i);
         }
 #if GPMPC_TUBES
         if (work->lane == GPMPC_LANES - 1 || k == GPMPC_STAGES - 1)
@@ -356,6 +374,24 @@ static void linearize(gpmpc_controller *controller)
 #endif
     }
     work->lane = -1;
+    return moves;
+}
+
+/* Replaces the states of the first guess by those that its inputs lead to, or by the
+   first one where these are not finite. */
+static void follow_inputs(gpmpc_controller *controller)
+{
+    gpmpc_problem *problem = &controller->problem;
+    int k, i;
+    for (k = 0; k < H; k++) {
+        model(problem->states[k], problem->inputs[k], &problem->work,
+              problem->states[k + 1], 0, 0);
+        for (i = 0; i < n && GPMPC_ESTIMATES; i++)
+            problem->states[k + 1][i] += controller->disturbance[i];
+    }
+    if (!all_finite(&problem->states[0][0], (H + 1) * n))
+        for (k = 1; k <= H; k++)
+            copy(problem->states[0], problem->states[k], n);
 }
 
 #if GPMPC_HELD
@@ -1409,7 +1445,10 @@ static int write_problem(gpmpc_controller *controller, const real *state,
         estimate_disturbance(controller, state);
     guess_states(controller, state);
     guess_inputs(controller);
-    linearize(controller);
+    if (!linearize(controller)) {
+        follow_inputs(controller);
+        (void)linearize(controller);
+    }
 #if GPMPC_OUTPUTS
     if (!write_outputs(problem, reference))
         return 0;

@@ -24,10 +24,14 @@ from gpmpc.mpc._controller import (
     continued_means,
     read_parameters,
 )
-from gpmpc.mpc._linear_quadratic import Plan
+from gpmpc.mpc._linear_quadratic import Plan, Stages
 from gpmpc.mpc._linearization import PredictionModel
 
 Array = np.ndarray
+
+#: A first guess is no motion where a stage of it ends further from where the model
+#: leads than this times the range of a state in the data.
+MOST_RANGES = 2.0
 
 
 def read_request(
@@ -191,3 +195,24 @@ def _guess_covariances(
     )
     covariances[1:] = predicted[1:]
     return covariances
+
+
+def is_contradicted(guess: Plan, stages: Stages, ranges: Array) -> bool:
+    """Returns whether a model leads far away from a guess, at some stage.
+
+    Args:
+        guess: A first plan.
+        stages: Linearised along it; one that is held contradicts nothing.
+        ranges: Of the states in the model's data (n,).
+    """
+    n = len(ranges)
+    if len(stages.next) != len(guess.inputs):
+        return False
+    misses = np.abs(stages.next[:, :n] - guess.states[1:, :n])
+    return bool((misses > MOST_RANGES * ranges).any())
+
+
+def motion_of(prediction: PredictionModel, guess: Plan, request: Request) -> Plan:
+    """Returns the plan that the inputs of a guess lead to by the model's means."""
+    states = prediction.lead(request.state, guess.inputs, request.disturbance)
+    return prediction.plan_of(states, guess.inputs, guess.covariances)

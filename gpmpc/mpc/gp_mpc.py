@@ -52,7 +52,12 @@ from gpmpc.mpc._controller import (
 )
 from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._elastic import NO_PRICE, TRIALS, elastic_limits, violations
-from gpmpc.mpc._guess import initial_guess, read_request
+from gpmpc.mpc._guess import (
+    initial_guess,
+    is_contradicted,
+    motion_of,
+    read_request,
+)
 from gpmpc.mpc._linear_quadratic import (
     CondensedProgram,
     Covariance,
@@ -263,6 +268,7 @@ class GPMPC:
             if local is None:
                 guess = initial_guess(self.prediction, request)
                 local = self.prediction.linearize(guess, request)
+            local = self._at_a_motion(local, request)
             is_first = request.previous is None and request.guessed_states is None
             number_is_open = self.iterations is None and self._most_programs > 1
             # A curved bound lies elsewhere than one program sees it.
@@ -274,6 +280,21 @@ class GPMPC:
             if isinstance(error, FunctionNotFinite):
                 status = Status.FUNCTION_NOT_FINITE
             return request.failed_decision(status, timing=stopwatch.timing)
+
+    def _at_a_motion(self, local: LocalProblem, request: Request) -> LocalProblem:
+        """Returns the problem at the first guess, or at what its inputs lead to.
+
+        The latter where the model contradicts the guess: derivatives along states that
+        no motion takes, multiplied over the horizon, may grow beyond any number. States
+        that were handed over are taken as they are.
+        """
+        scales = self._scales
+        if scales is None or request.guessed_states is not None:
+            return local
+        if not is_contradicted(local.plan, local.stages, scales.ranges):
+            return local
+        motion = motion_of(self.prediction, local.plan, request)
+        return self.prediction.linearize(motion, request)
 
     def _improve(
         self,

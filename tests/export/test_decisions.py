@@ -1,6 +1,7 @@
 """The compiled C decides as Python does."""
 
 import shutil
+from dataclasses import replace
 
 import casadi
 import numpy as np
@@ -319,3 +320,21 @@ def test_every_operation_of_casadi_is_written():
     for measured, reference in questions(controller, 60):
         expected = python.input(measured, reference)
         assert np.abs(compiled.input(measured, reference) - expected).max() < 1e-9
+
+
+def test_a_plan_that_the_model_contradicts_is_no_guess():
+    """The last plan is wild; what its inputs lead to is linearised in its place."""
+    controller = gpmpc(Problem(WEIGHTS, TORQUES), disturbance_gain=0.3)
+    compiled = CompiledController(controller, compiler=COMPILER)
+    belief = Gaussian.certain([0.3, -0.2])
+    origin = Reference(np.zeros(2))
+    last = controller.control(belief, origin)
+    means = last.means.copy()
+    means[3:, 0] += 1e3
+    wild = replace(last, means=means)
+    inputs = np.concatenate([last.inputs[1:], last.inputs[-1:]])
+    motion = controller.control(belief, origin, wild, plan=inputs)
+    for asked in (controller, compiled):
+        got = asked.control(belief, origin, wild)
+        assert np.abs(got.inputs - motion.inputs).max() < 1e-9
+        assert np.abs(got.means - motion.means).max() < 1e-9
