@@ -31,6 +31,9 @@ _LINEARIZED = 400  # of all folds, along which rollouts are linearised: these ar
 _LINEARIZED_WITH_MEMORY = 120  # likewise of models with many entries to carry on
 _STRIDE_WITH_MEMORY = 8  # of the windows that are linearised of these
 _DIFFERENCE = 1e-6
+_MOST = 9.0  # of the mean squared error: variance that is claimed at most
+_LEAST_FREEDOM = 4.0  # independent errors that a variance is supposed to be of
+_CUTS = 8  # rounds in which what is cut off is made up for
 _NOTHING = 1e-300  # least variance that anything is divided by
 # Both are multiples of the time T of the longest prediction.
 _FORGETTING = 6.0  # time constant with which the weight of an earlier error decays
@@ -53,6 +56,7 @@ def error_variances(
     # Neighbours respond alike.
     responses = _responses(model, windows[::stride], steps, noise.time_constants)
     explained = responses @ variances * noise.scales_at(steps)
+    explained = np.minimum(explained, noise.largest_at(steps))
     return np.repeat(explained, stride, axis=0)[: len(windows)]
 
 
@@ -126,7 +130,8 @@ def fit_noise(
         for model, log in zip(models, logs, strict=True)
     ]
     squared = np.concatenate([fold.squared for fold in folds]).mean(axis=0)
-    responses = np.concatenate([fold.responses for fold in folds]).mean(axis=0)
+    by_window = np.concatenate([fold.responses for fold in folds])
+    responses = by_window.mean(axis=0)
     residuals = np.concatenate([fold.squared_residuals for fold in folds]).mean(axis=0)
     relative = responses / np.maximum(squared, 1e-300)[..., None]
     relative = relative.reshape(-1, responses.shape[-1])
@@ -136,12 +141,26 @@ def fit_noise(
     targets = np.r_[np.ones(len(relative)), np.zeros(len(sharing))]
     variances = nnls(regressors, targets)[0] / factor
     output_sources = len(TIME_CONSTANTS) * len(residuals)
+    rows = sum(len(log) for log in logs)
+    largest = np.maximum(_MOST * squared, _NOTHING)
+    kinematics = models[0].kinematics
     return OutputNoise(
         outputs=variances[:output_sources].reshape(len(TIME_CONSTANTS), -1),
         measurement=variances[output_sources:],
         steps=tuple(steps),
-        scales=_scales(models[0].kinematics, squared, responses @ variances),
-    )
+        scales=_scales(kinematics, squared, by_window @ variances, largest),
+        largest=largest,
+    ).scaled(_student(rows, steps)[:, None])
+
+
+def _student(rows: int, steps: Sequence[int]) -> Array:
+    """Returns factors (steps,) of variances that few independent errors estimate.
+
+    They are those of Student's t distribution, whose degrees of freedom are the
+    predictions that do not overlap.
+    """
+    freedom = np.maximum(rows / np.asarray(steps), _LEAST_FREEDOM)
+    return freedom / (freedom - 2)
 
 
 def learning_gains(
@@ -174,23 +193,44 @@ def learning_gains(
             np.square(one.rollout_errors(windows, steps)).mean(axis=0)
             for one in (few, model)
         ]
-        ratios.append(np.log(_scales(model.kinematics, squared[1], squared[0])))
+        ratios.append(np.log(_group_ratios(model.kinematics, squared[1], squared[0])))
     gain = np.minimum(np.mean(ratios, axis=0), 0.0)
     variance = np.var(ratios, axis=0, ddof=1) / len(ratios)
     agreement = gain**2 / np.maximum(gain**2 + variance, _NOTHING)
     return np.exp(exponent * agreement * gain)
 
 
-def _scales(kinematics: Kinematics, squared: Array, explained: Array) -> Array:
-    """Computes squared errors over explained variances (steps, e), by group."""
-    scales = np.ones_like(squared)
+def _scales(
+    kinematics: Kinematics, squared: Array, explained: Array, largest: Array
+) -> Array:
+    """Computes factors (steps, e) with which variances explain squared errors.
+
+    Along a rollout that is barely stable, the linearisation may explain a thousand
+    times what it does elsewhere: variances are cut off, and the others make up for it.
+
+    Args:
+        kinematics: Have the groups, each of which has one factor.
+        squared: Mean squared errors (steps, e).
+        explained: Variances by window (V, steps, e).
+        largest: Variances at which they are cut off (steps, e).
+    """
+    scales = _group_ratios(kinematics, squared, explained.mean(axis=0))
+    for _ in range(_CUTS):
+        claimed = np.minimum(scales * explained, largest).mean(axis=0)
+        scales = scales * _group_ratios(kinematics, squared, claimed)
+    return scales
+
+
+def _group_ratios(kinematics: Kinematics, squared: Array, claimed: Array) -> Array:
+    """Computes squared errors over claimed variances (steps, e), by group."""
+    ratios = np.ones_like(squared)
     for columns in kinematics.space.error_columns:
         actual = squared[:, columns].sum(axis=1, keepdims=True)
-        claimed = explained[:, columns].sum(axis=1, keepdims=True)
-        scales[:, columns] = np.where(
-            np.minimum(actual, claimed) > 0, actual / np.maximum(claimed, _NOTHING), 1.0
+        total = claimed[:, columns].sum(axis=1, keepdims=True)
+        ratios[:, columns] = np.where(
+            np.minimum(actual, total) > 0, actual / np.maximum(total, _NOTHING), 1.0
         )
-    return scales
+    return ratios
 
 
 def _fold_errors(

@@ -116,7 +116,7 @@ class Validations:
             steps=noise.steps,
             exponent=_GAIN_EXPONENT,
         )
-        return replace(noise, scales=gains * noise.scales)
+        return noise.scaled(gains)
 
     def fit_to_all_runs(self, structure: Structure) -> NominalFit:
         """Fits a structure to all runs, its GPs and its correction as well."""

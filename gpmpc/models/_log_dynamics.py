@@ -9,7 +9,7 @@ controller's own estimate.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -43,8 +43,20 @@ class OutputNoise:
     steps: tuple[int, ...] = ()
     #: squared errors of held-out predictions over what the sources explain (S, e)
     scales: Array = field(default_factory=lambda: np.empty((0, 0)))
+    #: most variances that are claimed (S, e); none without ``steps``
+    largest: Array = field(default_factory=lambda: np.empty((0, 0)))
     #: of the outputs' noise [rows] (T,); zero is white
     time_constants: tuple[float, ...] = TIME_CONSTANTS
+
+    def scaled(self, factors: Array) -> "OutputNoise":
+        """Returns the noise with other variances of predictions.
+
+        Args:
+            factors: By which they change, by step and entry (S, e) or (S, 1).
+        """
+        return replace(
+            self, scales=factors * self.scales, largest=factors * self.largest
+        )
 
     def scales_at(self, steps: Sequence[int]) -> Array:
         """Returns factors (steps, e) of the variances that the sources explain.
@@ -54,7 +66,17 @@ class OutputNoise:
         """
         if not self.steps:
             return np.ones((len(steps), len(self.measurement)))
-        logarithms = np.log(self.scales)
+        return self._between(self.scales, steps)
+
+    def largest_at(self, steps: Sequence[int]) -> Array:
+        """Returns the most variances (steps, e) that are claimed, infinite without."""
+        if not self.largest.size:
+            return np.full((len(steps), len(self.measurement)), np.inf)
+        return self._between(self.largest, steps)
+
+    def _between(self, values: Array, steps: Sequence[int]) -> Array:
+        """Interpolates positive values (S, e) to (steps, e)."""
+        logarithms = np.log(values)
         columns = [
             np.interp(np.log(steps), np.log(self.steps), column)
             for column in logarithms.T

@@ -88,6 +88,8 @@ def log_model_parts(
     }
     if named.noise.steps:
         tensors["noise/scales"] = torch.from_numpy(named.noise.scales)
+    if named.noise.largest.size:
+        tensors["noise/largest"] = torch.from_numpy(named.noise.largest)
     gps = []
     for i, gp in enumerate(model.gps):
         gp_header, gp_tensors = posterior_parts(path, gp.posterior)
@@ -231,6 +233,8 @@ def log_model_of_parts(
             steps=tuple(header["noise_steps"]),
             scales=tensors["noise/scales"].numpy(),
         )
+    if "noise/largest" in tensors:  # likewise
+        noise = replace(noise, largest=tensors["noise/largest"].numpy())
     _check_noise(noise, kinematics)
     named = NamedLogModel(
         model=model,
@@ -636,6 +640,11 @@ def _check_noise(noise: OutputNoise, kinematics: Kinematics) -> None:
     check_shape("noise/scales", noise.scales, shape)
     if not (np.isfinite(noise.scales) & (noise.scales > 0)).all():
         raise DataError("noise/scales must be finite and positive")
+    if not noise.largest.size:
+        return
+    check_shape("noise/largest", noise.largest, shape)
+    if not (np.isfinite(noise.largest) & (noise.largest > 0)).all():
+        raise DataError("noise/largest must be finite and positive")
 
 
 def _check_noise_steps(steps: Sequence[int]) -> None:

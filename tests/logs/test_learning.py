@@ -1,5 +1,6 @@
 """Learning from logs by rollouts: parameters, noise and structure of flights."""
 
+import json
 import os
 import runpy
 from dataclasses import replace
@@ -22,13 +23,18 @@ from gpmpc.logs import (
     save_learned,
 )
 from gpmpc.logs._log import LogRun
-from gpmpc.logs._noise import error_variances, follow_errors
+from gpmpc.logs._noise import _scales, error_variances, follow_errors
 from gpmpc.logs._output_gps import choose_rows, train_output_gp
 from gpmpc.models import LogModel, MultirotorNominal, RigidBodyKinematics
 from gpmpc.models._kinematics import Increments
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._parametric import AffineNominal
 from gpmpc.models._quaternions import rotation_quaternion
+from gpmpc.models._stored_log_model import (
+    NamedLogModel,
+    log_model_of_parts,
+    log_model_parts,
+)
 
 EXAMPLE = runpy.run_path(
     str(Path(__file__).resolve().parents[2] / "examples" / "own_log.py")
@@ -360,9 +366,24 @@ def test_scales_of_a_noise_lie_between_their_steps():
     np.testing.assert_allclose(noise.scales_at((1, 10, 100, 500)), expected)
     without = OutputNoise(np.ones((4, 2)), np.ones(2))
     np.testing.assert_array_equal(without.scales_at((1, 10)), np.ones((2, 2)))
+    assert np.isinf(without.largest_at((1, 10))).all()
 
 
-def test_noise_is_of_rows_whatever_the_time_step(flights):
+def test_variances_that_explode_are_cut_off(flights):
+    """What is left of them still explains the errors."""
+    log = as_log(flights[:1])
+    kinematics = Increments(log.space)
+    squared = np.ones((1, 12))
+    explained = np.ones((50, 1, 12))
+    explained[0] = 1e4
+    largest = 9 * squared
+    scales = _scales(kinematics, squared, explained, largest)
+    claimed = np.minimum(scales * explained, largest)
+    np.testing.assert_allclose(claimed.mean(axis=0), squared, rtol=1e-3)
+    assert claimed[1].min() > 0.8
+
+
+def test_noise_is_of_rows_whatever_the_time_step(flights, tmp_path):
     log = as_log(flights[:1])
     kinematics = Increments(log.space)
     still = AffineNominal(kinematics, fitted=False)
@@ -374,6 +395,13 @@ def test_noise_is_of_rows_whatever_the_time_step(flights):
         cut = replace(windows, time_step=step)
         variances.append(error_variances(model, cut, noise, (1, 20)))
         np.testing.assert_allclose(variances[-1], variances[0], rtol=1e-3)
+    path = tmp_path / "model"
+    named = NamedLogModel(model, noise, ("a",) * 13, ("u",) * 4, (), 0.02)
+    header, tensors = log_model_parts(path, named)
+    header = json.loads(json.dumps(header))
+    assert log_model_of_parts(path, header, tensors).noise.time_constants[2] == 25
+    del header["noise_rows"]  # as in files from before: then they are seconds
+    assert log_model_of_parts(path, header, tensors).noise.time_constants[2] == 12.5
     white = replace(noise, time_constants=(0.0,) * 4)
     assert (error_variances(model, cut, white, (1, 20)) < variances[0])[:, 1].all()
 
