@@ -73,11 +73,11 @@ class Columns(NamedTuple):
         states, inputs = signal_names(transitions)
         magnitudes = None
         if predicts == "difference":
-            magnitudes = transitions.states.abs().amax(dim=0).numpy()
+            magnitudes = transitions.states.abs().amax(dim=0).numpy(force=True)
         return cls(features=states + inputs, outputs=states, magnitudes=magnitudes)
 
 
-class Constants(NamedTuple):
+class ColumnsAtRest(NamedTuple):
     """Which columns of a training's data never move."""
 
     features: NDArray[np.bool_]  #: (d,)
@@ -86,7 +86,7 @@ class Constants(NamedTuple):
     @classmethod
     def find(
         cls, features: Tensor, targets: Tensor, columns: Columns, resolution: float
-    ) -> "Constants":
+    ) -> "ColumnsAtRest":
         """Finds the columns of features (N, d) and targets (N, k) that never move.
 
         Both are in the units of the data.
@@ -114,10 +114,13 @@ def constant_columns(
     return np.ptp(columns, axis=0) <= np.maximum(ROUND_OFF * largest, resolution)
 
 
-def column_std(columns: np.ndarray, constant: np.ndarray | None = None) -> np.ndarray:
-    """Computes the standard deviation (d,) of columns (N, d).
+def column_scales(
+    columns: np.ndarray, constant: np.ndarray | None = None
+) -> np.ndarray:
+    """Computes the scales (d,) of columns (N, d): their standard deviations.
 
-    Of a constant column it takes the magnitude, or 1 where that is zero.
+    That of a constant column is its magnitude, or 1 where that is at most 1e-9
+    (``RESOLUTION``).
 
     Args:
         columns: (N, d).
@@ -174,7 +177,7 @@ def warn_of_transitions(transitions: Transitions) -> None:
     next_states = transitions.next_states
     moving = (states != next_states).any(dim=1)
     if not bool(moving.any()):
-        if not constant_columns(states.numpy()).all():
+        if not constant_columns(states.numpy(force=True)).all():
             _log.warning(
                 "training: next_states equal states in all %d rows, though the states "
                 "differ from row to row: next_states[k] must be the states one step "

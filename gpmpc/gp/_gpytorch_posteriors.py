@@ -133,7 +133,7 @@ class KernelPosterior(TensorModel):
         query = torch.cat([state, input], dim=-1)
         rows = query.reshape(-1, query.shape[-1])
         predictions = [part.predict(rows) for part in self.parts]
-        shape = (*state.shape[:-1], -1)
+        shape = (*state.shape[:-1], self.output_dim)
         mean = torch.cat([p.mean for p in predictions], dim=-1).reshape(shape)
         variance = torch.cat([p.variance for p in predictions], dim=-1).reshape(shape)
         if self.predicts == "difference":

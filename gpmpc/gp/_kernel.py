@@ -13,8 +13,15 @@ language needs it; a change of the kernel is a change of each:
     _kernels/_gp_point.write_kernel     compiled              tests/kernels/test_kernels
     _kernels/gp_rollout._write_means    compiled              tests/models/test_roll_out
     mpc/_slopes._gp_covariances  NumPy, of derivatives        tests/mpc/test_slopes
+    gp/_posterior._jacobian      torch, of the mean           tests/gp/test_posterior
+    gp/_sparse._cross            torch, by matrix products    tests/gp/test_sparse
 
 (``propagation._moments`` and ``_kernels._gp_moments`` hold its expectations.)
+
+Its parameters stand elsewhere too: rows theta = (log l, log sf, log(sf / sn)) in
+``Hyperparameters``, ``gp._search``, ``gp._training_data`` and ``gp._sparse_training``;
+the kernel's name in files, ``gp._storage`` ("SE-ARD", where they are written and read);
+and what ``from_gpytorch`` takes for it, ``gp._gpytorch._check_se_ard``.
 """
 
 from typing import Any, NamedTuple

@@ -371,6 +371,8 @@ def _checked_indices(indices: Sequence[int] | Tensor, size: int) -> list[int]:
 
     Negative ones count from the end, as everywhere.
     """
+    if isinstance(indices, Tensor):
+        indices = indices.cpu()
     values = np.atleast_1d(np.asarray(indices)).tolist()
     for i in values:
         is_whole = isinstance(i, int) and not isinstance(i, bool)

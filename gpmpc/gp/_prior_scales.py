@@ -7,7 +7,7 @@ the length-scales that GPyTorch begins with (0.69) and leaves untouched. Where a
 lies does not count, as it does not for any other (350 K is no scale of a temperature),
 nor does a scaling, which has nothing to go by. Longer is not safer: on its way back to
 the prior a mean has a slope that nobody has seen, over as much as a length-scale, and a
-controller follows it. One who knows the ranges says so.
+controller follows it. Who knows the ranges sets ``prior_lengthscale``.
 """
 
 import math

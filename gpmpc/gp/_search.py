@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, check_number
-from gpmpc.gp._data_checks import column_std
+from gpmpc.gp._data_checks import column_scales
 from gpmpc.gp._kernel import IGNORED
 from gpmpc.gp._likelihood import NegativeLogMarginalLikelihood
 
@@ -117,7 +117,9 @@ class SearchFeatures(NamedTuple):
     """The features of all GPs in scaled units."""
 
     points: np.ndarray  #: x~ (N, d)
-    std: np.ndarray  #: standard deviations (d,); see ``column_std``
+    #: standard deviations, or magnitudes of what never moves (d,); see
+    #: ``column_scales``
+    scales: np.ndarray
     constant: np.ndarray  #: which features never move (d,)
     prior_lengthscales: np.ndarray  #: of those that never move (d,)
 
@@ -168,11 +170,11 @@ class OutputSearch:
         # A feature that is known to have no effect drops out of the kernel.
         prior = features.prior_lengthscales
         ignored = features.constant & np.isinf(prior)
-        self._log_prior = np.log(np.where(ignored, IGNORED * features.std, prior))
+        self._log_prior = np.log(np.where(ignored, IGNORED * features.scales, prior))
         # What length-scales are measured by: standard deviations, or the prior
         # length-scales of features at rest.
         at_rest = features.constant & ~ignored
-        self._log_scales = np.log(np.where(at_rest, prior, features.std))
+        self._log_scales = np.log(np.where(at_rest, prior, features.scales))
         self._log_output = np.log(_output_std(targets))
         self._box = search_box(
             self._log_scales, self._log_output, settings.signal_to_noise_limit
@@ -345,12 +347,16 @@ def search_box(
     return SearchBox(lower=middle - half_width, upper=middle + half_width)
 
 
-def plain_theta(std: np.ndarray, targets: np.ndarray) -> np.ndarray:
+def plain_theta(scales: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Returns theta (d + 2,) where the search begins.
 
     l = std(x~), sf = std(y), sn = std(y) / 10.
+
+    Args:
+        scales: std(x~) (d,).
+        targets: y (N,).
     """
-    return np.append(np.log(std), np.log([_output_std(targets), _PLAIN_RATIO]))
+    return np.append(np.log(scales), np.log([_output_std(targets), _PLAIN_RATIO]))
 
 
 def _output_std(targets: np.ndarray) -> float:
@@ -359,4 +365,4 @@ def _output_std(targets: np.ndarray) -> float:
     Where the prior mean is far from them, signals are of their magnitude.
     """
     small = np.ptp(targets) <= _SMALL * np.abs(targets).max()
-    return float(column_std(targets[:, None], np.array([small]))[0])
+    return float(column_scales(targets[:, None], np.array([small]))[0])

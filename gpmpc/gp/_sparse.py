@@ -131,8 +131,12 @@ def collapsed_bound(
     """Computes the bound on the log marginal likelihood of every output (k,).
 
     With FITC it is that method's own log marginal likelihood. ``backward``
-    differentiates it by inducing points and hyperparameters. Arguments and errors are
-    as for ``sparse_posterior``.
+    differentiates it by inducing points and hyperparameters. Arguments are as for
+    ``sparse_posterior``; the data are not checked.
+
+    Raises:
+        SettingError: Kzz is not positive definite.
+        torch.linalg.LinAlgError: I + A A' is not, to double precision.
     """
     bounds = [
         _output_bound(

@@ -25,9 +25,9 @@ from gpmpc.exceptions import SettingError, TrainingError, check_choice, check_nu
 from gpmpc.gp._data_checks import (
     RESOLUTION,
     Columns,
-    Constants,
+    ColumnsAtRest,
     checked_targets,
-    column_std,
+    column_scales,
 )
 from gpmpc.gp._kernel import Hyperparameters, kernel_matrix
 from gpmpc.gp._prior_scales import PriorLengthscales
@@ -150,14 +150,16 @@ class SparseTrainer:
         scaling = Scaling(data.features[0], data.feature_scaling.factor)
         x = scaling.scale(data.features)
         y = data.scaled_targets
-        std = torch.from_numpy(data.feature_std) / scaling.factor
+        scales = torch.from_numpy(data.feature_scales) / scaling.factor
 
         rows = np.random.default_rng(seed).permutation(len(x))[: self.subset]
         subset = self._subset_data(data, rows)
         exact = self._exact_trainer().fit_data(subset, seed)
-        theta = scaled_theta(exact.posterior, scaling, subset.target_scaling)
-        _start_what_moved_elsewhere(theta, data, subset, std.numpy(), y.numpy())
-        kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
+        subset_theta = scaled_theta(exact.posterior, scaling, subset.target_scaling)
+        start_theta = _with_plain_starts(
+            subset_theta, data, subset, scales.numpy(), y.numpy()
+        )
+        kernel = Hyperparameters.from_theta(torch.from_numpy(start_theta))
         Z = x[informative_points(x, kernel, self.inducing)]
         _log.info(
             "sparse training: %d inducing points chosen among %d after %.1f s",
@@ -165,12 +167,12 @@ class SparseTrainer:
             len(x),
             time.perf_counter() - start_time,
         )
-        theta = self._with_unexplained(theta, Z, x, y)
+        bound_theta = self._with_unexplained(start_theta, Z, x, y)
 
         bound = _NegativeBound(
-            x, y, std, method=self.method, iterations=self.iterations
+            x, y, scales, method=self.method, iterations=self.iterations
         )
-        bound.start_at(theta, Z, fixed=_fixed_entries(theta, data))
+        bound.start_at(bound_theta, Z, fixed=_fixed_entries(bound_theta, data))
         initial = bound.values()
         bound.minimize()
         objective = bound.values()
@@ -219,7 +221,7 @@ class SparseTrainer:
         """Some rows with scaled targets, which may hold still what moves elsewhere."""
         features = data.features[rows]
         scaled_targets = data.scaled_targets
-        constants = Constants.find(
+        constants = ColumnsAtRest.find(
             features, data.targets[rows], data.columns, self.resolution
         )
         return TrainingData(
@@ -288,27 +290,29 @@ class SparseTrainer:
             )
 
 
-def _start_what_moved_elsewhere(
+def _with_plain_starts(
     theta: np.ndarray,
     data: TrainingData,
     subset: TrainingData,
-    std: np.ndarray,
+    scales: np.ndarray,
     targets: np.ndarray,
-) -> None:
-    """Writes to theta (k, d + 2) the plain start of what only the subset held still.
+) -> np.ndarray:
+    """Returns theta (k, d + 2) with the plain start of what only the subset held still.
 
     Args:
         theta: Rows that the subset's training has found.
         data: All data.
         subset: The subset.
-        std: Standard deviations of the scaled features (d,).
+        scales: Standard deviations of the scaled features (d,).
         targets: Scaled (N, k).
     """
+    started = theta.copy()
     moves = subset.constants.features & ~data.constants.features
-    theta[:, :-2][:, moves] = np.log(std)[moves]
+    started[:, :-2][:, moves] = np.log(scales)[moves]
     changes = subset.constants.outputs & ~data.constants.outputs
     for a in np.flatnonzero(changes):
-        theta[a] = plain_theta(std, targets[:, a])
+        started[a] = plain_theta(scales, targets[:, a])
+    return started
 
 
 def _fixed_entries(theta: np.ndarray, data: TrainingData) -> np.ndarray:
@@ -391,11 +395,11 @@ class _NegativeBound:
     """
 
     def __init__(
-        self, x: Tensor, y: Tensor, std: Tensor, method: Method, iterations: int
+        self, x: Tensor, y: Tensor, scales: Tensor, method: Method, iterations: int
     ):
         self._x = x
         self._y = y
-        self._std = std
+        self._scales = scales
         self._method: Method = method
         self._max_iterations = iterations
         self._outputs = y.shape[1]
@@ -414,7 +418,7 @@ class _NegativeBound:
             Z: (M, d).
             fixed: Entries of theta that are not searched (k, d + 2).
         """
-        scaled = (Z / self._std).numpy().ravel()
+        scaled = (Z / self._scales).numpy().ravel()
         self.best = np.append(theta.ravel(), scaled)
         self._fixed = np.append(fixed.ravel(), np.zeros(scaled.size, dtype=bool))
 
@@ -439,13 +443,13 @@ class _NegativeBound:
 
     def _bounds(self) -> np.ndarray:
         """Lower and upper bounds of the vector in two columns."""
-        log_std = self._std.log().numpy()
+        log_scales = self._scales.log().numpy()
         boxes = [
-            search_box(log_std, log_output, _SIGNAL_TO_NOISE)
-            for log_output in np.log(column_std(self._y.numpy()))
+            search_box(log_scales, log_output, _SIGNAL_TO_NOISE)
+            for log_output in np.log(column_scales(self._y.numpy()))
         ]
-        smallest = (self._x.amin(0) / self._std).numpy()
-        largest = (self._x.amax(0) / self._std).numpy()
+        smallest = (self._x.amin(0) / self._scales).numpy()
+        largest = (self._x.amax(0) / self._scales).numpy()
         margin = 0.1 * (largest - smallest)
         inducing = (len(self.best) - self._theta_size) // len(smallest)
         lower = np.concatenate(
@@ -463,8 +467,8 @@ class _NegativeBound:
     def unpack(self, vector: Tensor) -> _Point:
         """Reads the rows of theta (k, d + 2) and Z (M, d)."""
         theta = vector[: self._theta_size].reshape(self._outputs, -1)
-        scaled = vector[self._theta_size :].reshape(-1, len(self._std))
-        return _Point(theta=theta, inducing=scaled * self._std)
+        scaled = vector[self._theta_size :].reshape(-1, len(self._scales))
+        return _Point(theta=theta, inducing=scaled * self._scales)
 
     def values(self) -> np.ndarray:
         """Computes minus the bound of every output (k,) at the best point.

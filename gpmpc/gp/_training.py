@@ -72,14 +72,15 @@ class Training:
     #: rows (log l, log sf, log(sf / sn)), one an output (k, d + 2), in the units of the
     #: data
     theta: np.ndarray
-    #: negative log marginal likelihood plus penalty where the search ended (k,); of a
-    #: sparse training minus the bound on the log marginal likelihood; both of the
-    #: scaled targets
+    #: negative log marginal likelihood plus penalty where the search ended (k,),
+    #: without the penalty of an output at rest, which is not searched
+    #: (``prior_deviation``); of a sparse training minus the bound on the log marginal
+    #: likelihood; both of the scaled targets
     objective: np.ndarray
     #: of an exact training, the objective where the exploration from every start ended
     #: (k, restarts + 1), over the subset if there is one, NaN for starts that a time
-    #: limit left out; of a sparse training, where the search over the bound began
-    #: (k, 1)
+    #: limit left out, and for all but the first of an output at rest; of a sparse
+    #: training, where the search over the bound began (k, 1)
     explored: np.ndarray
     #: of the likelihood or of the bound, all starts and outputs together
     evaluations: int
@@ -336,9 +337,10 @@ class Trainer:
     ) -> list[np.ndarray | None]:
         """The first start (d + 2,) of every output; None for the plain one.
 
-        Hyperparameters of a posterior say nothing of what its data held still: a
-        feature that moves by now begins with its standard deviation, and an output that
-        changes by now with the plain start.
+        Hyperparameters of a posterior say nothing of what its data held still. Where
+        the start's data held a feature constant and these do not, its length-scale
+        begins with its standard deviation; an output that is newly changing begins
+        with the plain start.
         """
         if start is None:
             return [None] * data.targets.shape[1]
@@ -346,8 +348,8 @@ class Trainer:
         theta = scaled_theta(start, data.feature_scaling, data.target_scaling)
         start_features = start.features.cpu().double().numpy()
         was_constant = constant_columns(start_features, self.resolution)
-        moves_by_now = was_constant & ~data.constants.features
-        theta[:, :-2][:, moves_by_now] = np.log(features.std)[moves_by_now]
+        newly_moving = was_constant & ~data.constants.features
+        theta[:, :-2][:, newly_moving] = np.log(features.scales)[newly_moving]
         targets = start.targets.cpu().double().numpy()
         never_changed = constant_columns(targets, self.resolution)
         return [
@@ -408,7 +410,7 @@ def _search_features(data: TrainingData) -> SearchFeatures:
     factor = data.feature_scaling.factor.numpy()
     return SearchFeatures(
         points=data.feature_scaling.scale(data.features).numpy(),
-        std=data.feature_std / factor,
+        scales=data.feature_scales / factor,
         constant=data.constants.features,
         prior_lengthscales=data.prior.lengthscales / factor,
     )

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import check_tensors
-from gpmpc.gp._data_checks import Columns, Constants, column_std
+from gpmpc.gp._data_checks import Columns, ColumnsAtRest, column_scales
 from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._prior_scales import (
     PriorLengthscales,
@@ -70,7 +70,7 @@ class TrainingData:
     feature_scaling: Scaling
     target_scaling: Scaling
     columns: Columns  #: names and magnitudes of features and targets
-    constants: Constants  #: what never moves
+    constants: ColumnsAtRest  #: what never moves
     prior: PriorScales  #: of what never moves
 
     def __len__(self) -> int:
@@ -82,9 +82,9 @@ class TrainingData:
         return self.target_scaling.scale(self.targets)
 
     @property
-    def feature_std(self) -> NDArray[np.float64]:
-        """Standard deviations of the features (d,); see ``column_std``."""
-        return column_std(self.features.numpy(), self.constants.features)
+    def feature_scales(self) -> NDArray[np.float64]:
+        """Scales of the features (d,); see ``column_scales``."""
+        return column_scales(self.features.numpy(), self.constants.features)
 
     @property
     def unsearched_outputs(self) -> NDArray[np.bool_]:
@@ -133,7 +133,7 @@ def read_training_data(
         feature_scaling=feature_scaling,
         target_scaling=target_scaling,
         columns=columns,
-        constants=Constants.find(features, targets, columns, settings.resolution),
+        constants=ColumnsAtRest.find(features, targets, columns, settings.resolution),
         prior=PriorScales.of_settings(
             settings.prior_lengthscale,
             settings.prior_deviation,

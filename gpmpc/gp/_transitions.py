@@ -225,9 +225,9 @@ class Transitions:
             states: Names of the columns x[k].
             inputs: Names of the columns u[k].
             next_states: Names of the columns x[k+1], sorted as the states where they
-                are the states' names with a prefix or suffix. ``None`` takes the file
-                for one recording at equal time steps: the next row's states are the
-                next states, and the last row only serves as such.
+                are the states' names with a prefix or suffix. None, or an empty list,
+                takes the file for one recording at equal time steps: the next row's
+                states are the next states, and the last row only serves as such.
             time_step: Between the two states of a row [s], where it is known.
 
         Raises:
@@ -306,10 +306,10 @@ def _check_finite(name: str, value: Tensor) -> None:
 
 
 def _real(key: str, values: Any, names: Sequence[str] = ()) -> Tensor:
-    """Reads a table of numbers as float64, its columns in the order of the names."""
+    """Copies a table of numbers as float64, its columns in the order of the names."""
     is_tensor = isinstance(values, Tensor) and values.dtype != torch.bool
     if is_tensor and not values.is_complex() and not values.requires_grad:
-        return values.to(torch.float64)
+        return values.to(torch.float64, copy=True)
     rule = "must be numbers in rows and columns"
     return torch.from_numpy(np.array(read_array(key, values, names, rule)))
 

@@ -20,14 +20,12 @@ from gpmpc._angles import TURN
 from gpmpc.gp._transitions import Transitions
 
 _log = logging.getLogger(__name__)
-_FAR_SMALLER_APART = (
-    1 / 10
-)  # of a turn: as below, where values lie farther apart than a turn
+# of a turn: as ``Turn.far_smaller``, where values lie farther apart than a turn
+_FAR_SMALLER_APART = 1 / 10
 _EXACT = 0.1  # of a turn, by which jumps may miss whole turns there
 _SLACK = 0.005  # of a turn: noise that was added after the angle was wrapped
-_AS_SMALL = (
-    1.15  # what is left of jumps without whole turns, over the largest other step
-)
+# what is left of jumps without whole turns, over the largest other step
+_AS_SMALL = 1.15
 
 
 DECLARE = (

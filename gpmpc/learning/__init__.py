@@ -16,12 +16,12 @@ Length-scales and signal variances are the model's: the plant may differ by a sh
 what was learned. Where nothing was seen lately d is zero, and with one point it is the
 estimate of a constant disturbance.
 
-Each step of the flight becomes a point of the change, whether that is used or not. The
-model with its change and the one without predict each step before they see it: the
-change is used once its log densities, summed over a window of steps, lead by a margin,
-and ceases to be used once they trail. The model's noise is scaled by what successive
-errors differ by, in the median, where that is more. A decision that fails with the
-change is taken without it.
+Each step of the flight becomes a point of the change, whether the change is used or
+not. The model with its change and the one without predict each step before they see it:
+the change is used once its log densities, summed over a window of steps, lead by a
+margin, and ceases to be used once they trail. The model's noise is scaled by what
+successive errors differ by, in the median, where that is more. A decision that fails
+with the change is taken without it.
 
 One wrong measurement spoils two transitions, the one into it and the one out of it, and
 their errors have opposite signs; those of another plant agree. So a measurement that

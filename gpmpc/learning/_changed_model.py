@@ -173,17 +173,20 @@ class ChangedModel(Wrapper):
             SettingError: The noise is too small.
         """
         capacity = self.learning.points
-        leaving = max(1, capacity // 5)  # points that go at once
-        step = len(self) - (capacity - leaving)  # of the ``leaving`` before they go
+        points_to_drop = max(1, capacity // 5)  # at once
+        points_until_rebuild = capacity - points_to_drop
+        # From 1 to ``points_to_drop`` while the successor's factor is made.
+        rebuild_step = len(self) - points_until_rebuild
         current, successor = self.change
-        if step > 0 and successor is None:
-            successor = current.without(self._first_to_go(leaving))
-        if successor is not None and step == leaving:
+        if rebuild_step > 0 and successor is None:
+            successor = current.without(self._first_to_go(points_to_drop))
+        if successor is not None and rebuild_step == points_to_drop:
             current = successor
             successor = None
         elif successor is not None:
             # Rows cost the square of their number: so every step does as much.
-            rows = int((capacity - leaving) * (step / leaving) ** (1 / 3))
+            part = (rebuild_step / points_to_drop) ** (1 / 3)
+            rows = int(points_until_rebuild * part)
             successor = successor.append(point, target, noise_variance, rows=rows)
         current = current.append(point, target, noise_variance)
         return self._copy_with(change=ChangeWindows(current, successor))
@@ -233,7 +236,9 @@ class ChangedModel(Wrapper):
         model = self.with_point(step.point, step.error, step.noise_variance)
         last = model.last_innovation()
         change_variance = last.variance - step.noise_variance
-        latent = self.remaining(step.latent_variance, change_variance, self.signal)
+        latent = self.latent_left_by_change(
+            step.latent_variance, change_variance, self.signal
+        )
         return Comparison(
             with_change=Innovation(last.error, last.variance + latent),
             without_change=Innovation(
@@ -252,13 +257,20 @@ class ChangedModel(Wrapper):
         root = column[:, len(self) - 1]
         return Innovation(error=column[:, -1] * root, variance=root**2)
 
-    def remaining(self, latent: Any, variance: Any, signal: Any) -> Any:
-        """What the model alone does not know (*batch, k), less what d's points saw.
+    def latent_left_by_change(self, latent: Any, variance: Any, signal: Any) -> Any:
+        """Computes the variance of the model alone that points of d leave.
 
-        Where its ``latent`` variance is more than d's prior variance, the ``signal``,
-        it knows nothing, as where an input moves that its data held still. There an
-        error teaches both at once, and of the excess as large a part is left as of the
-        signal is in d's own ``variance``. All three are NumPy's arrays, or torch's.
+            latent - max(latent - signal, 0) (1 - min(variance / signal, 1))
+
+        Where the model alone varies by more than d does before it has seen a point, it
+        knows nothing, as where an input moves that its data held still. There an error
+        teaches both at once, and of that excess as large a part is left as of the
+        signal is in d's own variance.
+
+        Args:
+            latent: Variance of the model alone (*batch, k), of NumPy or torch.
+            variance: Of d with its points (*batch, k).
+            signal: Of d without (k,).
         """
         excess = (latent - signal).clip(0.0)
         left = (variance / signal).clip(None, 1.0)
@@ -298,12 +310,18 @@ class ChangedModel(Wrapper):
             return belief
         z, v = self.features(state, input)
         time = torch.full_like(state[..., :1], self.time)
-        d = self.posterior.predict(z, torch.cat([v, time], dim=-1))
+        # The change is in float64, whatever the model's type.
+        change = self.posterior.predict(
+            z.double(), torch.cat([v, time], dim=-1).double()
+        )
+        change_mean = change.mean.to(belief.mean)
+        change_variance = change.variance.to(belief.mean)
         B_inverse = torch.as_tensor(self.B_inverse).to(belief.mean)
         latent = ((B_inverse @ belief.covariance) * B_inverse).sum(-1)
         signal = torch.as_tensor(self.signal).to(belief.mean)
-        variance = self.remaining(latent, d.variance, signal) + d.variance
-        mean = belief.mean + d.mean @ self.B.mT
+        latent_left = self.latent_left_by_change(latent, change_variance, signal)
+        variance = latent_left + change_variance
+        mean = belief.mean + change_mean @ self.B.mT
         return Gaussian(mean, self.B @ torch.diag_embed(variance) @ self.B.mT)
 
     def linearize(
@@ -327,7 +345,8 @@ class ChangedModel(Wrapper):
         if V is not None and change.covariance is not None:
             variance = np.diagonal(change.covariance, axis1=1, axis2=2)
             latent = self.explainable_variance(V)
-            variance = variance + self.remaining(latent, variance, self.signal)
+            latent_left = self.latent_left_by_change(latent, variance, self.signal)
+            variance = variance + latent_left
             V = (B * variance[:, None, :]) @ B.T
         return Linearized(
             mean=model.mean + change.mean @ B.T,

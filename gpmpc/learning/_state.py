@@ -33,8 +33,8 @@ class Doubt(NamedTuple):
     #: the model whose change only the steps in doubt have taught, in case that the
     #: plant is another one; None where they teach nothing
     new_plant: ChangedModel | None
-    missing: int  #: steps that have still to confirm ``new_plant``
-    steps: int  #: for which nothing has explained what is measured
+    confirmations_left: int  #: steps that have still to confirm ``new_plant``
+    steps_in_doubt: int  #: for which nothing has explained what is measured
     tries_new_plant: bool = False  #: whether ``new_plant`` plans before it is confirmed
 
 
@@ -56,7 +56,7 @@ class LearningState:
     active: bool = False  #: whether the change is used
     version: int = 0  #: how often the model that plans has changed
     #: steps that nothing has explained, less those that went as predicted since then
-    unexplained: int = 0
+    unexplained_steps: int = 0
     doubt: Doubt | None = None  #: where the last measurement is held back
 
     @classmethod
@@ -66,7 +66,7 @@ class LearningState:
         """Returns the state of a flight that begins at a measured state (n,)."""
         return cls(
             model=model,
-            state=state,
+            state=np.array(state, dtype=float),
             error=np.full(len(model.gp_noise), np.nan),
             noise_ratios=np.empty(0),
             leads=np.empty(0),
@@ -75,11 +75,19 @@ class LearningState:
 
     @property
     def planning(self) -> ChangedModel | None:
-        """The model that plans now; None for the one without a change."""
+        """The model that plans now; None for the one without a change.
+
+        After two steps in doubt the model plans as it was learned.
+        """
         if self.doubt is not None and self.doubt.tries_new_plant:
             return self.doubt.new_plant
-        lasting = self.doubt is not None and self.doubt.steps > 1
-        return self.model if self.active and not lasting else None
+        still_unexplained = self.doubt is not None and self.doubt.steps_in_doubt > 1
+        return self.model if self.active and not still_unexplained else None
+
+    @property
+    def _tries_new_plant(self) -> bool:
+        """Whether another plant's model plans before it is confirmed."""
+        return self.doubt is not None and self.doubt.tries_new_plant
 
     @property
     def size(self) -> int:
@@ -95,14 +103,13 @@ class LearningState:
         self, state: Array, error: Array, noise_ratios: Array
     ) -> "LearningState":
         """Returns the state after a further measurement (n,)."""
-        was_tried = self.doubt is not None and self.doubt.tries_new_plant
         return replace(
             self,
             state=state,
             error=error,
             noise_ratios=noise_ratios,
             # A change that was tried for a step ends.
-            version=self.version + was_tried,
+            version=self.version + self._tries_new_plant,
         )
 
     def without_change(self) -> "LearningState":
@@ -124,9 +131,10 @@ class LearningState:
         """
         after = replace(
             self,
-            state=state,
+            state=np.array(state, dtype=float),
             error=np.full_like(self.error, np.nan),
-            version=self.version + self.active,
+            # A change that is used, or was tried, is another one after the gap.
+            version=self.version + (self.active or self._tries_new_plant),
             doubt=None,
         )
         return after.later()

@@ -36,7 +36,9 @@ def learn_from_step(
         measured: State measured after it (n,).
     """
     model = learning.model
-    input = np.asarray(input, dtype=float)
+    # Arrays of their own: callers may reuse theirs.
+    input = np.array(input, dtype=float)
+    measured = np.array(measured, dtype=float)
     observed = model.error(learning.state, input, measured)
     noise_ratios = _with_noise_ratio(learning, observed.error)
     seen = learning.with_measurement(measured, observed.error, noise_ratios)
@@ -60,7 +62,8 @@ def learn_from_step(
         return _accept(seen, comparison)
     expected = seen.expect(Expectation.certain(learning.state), step)
     if surprising or _is_frozen(seen, step, expected):
-        return _put_in_doubt(seen, step, comparison, expected)
+        trusted = learning.noise_ratios  # those before this step
+        return _put_in_doubt(seen, step, comparison, expected, trusted)
     return seen.later()
 
 
@@ -92,8 +95,8 @@ def _chi2_median(degrees: int) -> float:
 
 def _accept(seen: LearningState, comparison: Comparison) -> LearningState:
     """Makes a step a point of the change, and decides whether the change is used."""
-    unexplained = max(0, seen.unexplained - 1)
-    learned = replace(seen, model=comparison.model, unexplained=unexplained)
+    unexplained_steps = max(0, seen.unexplained_steps - 1)
+    learned = replace(seen, model=comparison.model, unexplained_steps=unexplained_steps)
     return _count_lead(learned, comparison.lead)
 
 
@@ -117,6 +120,7 @@ def _put_in_doubt(
     step: LearningStep,
     comparison: Comparison,
     expected: Expectation,
+    noise_ratios: Array,
 ) -> LearningState:
     """Holds a measurement back that no prediction explains.
 
@@ -125,25 +129,25 @@ def _put_in_doubt(
         step: The step that led to it.
         comparison: Of the predictions of the step.
         expected: Where the plant is if all measurements in doubt are wrong.
+        noise_ratios: Those before the steps in doubt.
     """
     settings = seen.model.learning
     if seen.doubt is None:
-        unexplained = seen.unexplained
-        steps = 1
-        noise_ratios = seen.noise_ratios[:-1]
+        unexplained_steps = seen.unexplained_steps
+        steps_in_doubt = 1
     else:
-        unexplained = min(seen.unexplained + 1, _PATIENCE)
-        steps = seen.doubt.steps + 1
-        noise_ratios = seen.doubt.noise_ratios
+        unexplained_steps = min(seen.unexplained_steps + 1, _PATIENCE)
+        steps_in_doubt = seen.doubt.steps_in_doubt + 1
 
     new_plant = None
-    missing = 1 + unexplained
+    confirmations_left = 1 + unexplained_steps
     tries_new_plant = False
     if not _is_frozen(seen, step, expected):
         alone = seen.model.without_points().compare(step)
         new_plant = alone.model.later(1.0)
-        missing += int(alone.with_change.largest_square / settings.surprise)
-        tries_new_plant = missing == 1 and _acts_like_input(
+        further = int(alone.with_change.largest_square / settings.surprise)
+        confirmations_left += further
+        tries_new_plant = confirmations_left == 1 and _acts_like_input(
             innovation=comparison.planned(seen.active),
             by_input=seen.model.B_inverse @ expected.by_input,
             surprise=settings.surprise,
@@ -151,13 +155,13 @@ def _put_in_doubt(
 
     in_doubt = replace(
         seen,
-        unexplained=unexplained,
+        unexplained_steps=unexplained_steps,
         doubt=Doubt(
             expected=expected,
             noise_ratios=noise_ratios,
             new_plant=new_plant,
-            missing=missing,
-            steps=steps,
+            confirmations_left=confirmations_left,
+            steps_in_doubt=steps_in_doubt,
             tries_new_plant=tries_new_plant,
         ),
         version=seen.version + tries_new_plant,
@@ -205,20 +209,20 @@ def _resolve_doubt(
 
     density_to_beat = max(if_wrong.log_density, if_moved.log_density) + LARGEST_LEAD
     new_plant = _confirm_new_plant(doubt, step, density_to_beat, settings)
-    if new_plant is not None and doubt.missing == 1:
+    if new_plant is not None and doubt.confirmations_left == 1:
         return _switch_plant(seen, new_plant)
     if new_plant is not None:
         confirmed = Doubt(
             expected=expected,
             noise_ratios=doubt.noise_ratios,
             new_plant=new_plant.later(1.0),
-            missing=doubt.missing - 1,
-            steps=doubt.steps + 1,
+            confirmations_left=doubt.confirmations_left - 1,
+            steps_in_doubt=doubt.steps_in_doubt + 1,
         )
         return _count_doubtful_lead(replace(seen, doubt=confirmed), comparison.lead)
     if min(if_moved.largest_square, if_wrong.largest_square) <= settings.surprise:
         return _count_doubtful_lead(seen.without_doubt(doubt), comparison.lead)
-    return _put_in_doubt(seen, step, comparison, expected)
+    return _put_in_doubt(seen, step, comparison, expected, doubt.noise_ratios)
 
 
 def _confirm_new_plant(

@@ -62,24 +62,24 @@ def expand_to_second_order(
     _, states, inputs = arrays
     states = states.reshape(-1, gp.state_dim)
     inputs = inputs.reshape(len(states), gp.input_dim)
-    at = kernels.expand_gps(gp.packed, states, inputs)
+    expansion = kernels.expand_gps(gp.packed, states, inputs)
 
     def tensor(rows: kernels.Array) -> Tensor:
         return torch.from_numpy(rows.reshape(*batch, *rows.shape[1:]))
 
-    mean = tensor(at.M) + gp.offset
-    A = tensor(at.J)
+    mean = tensor(expansion.M) + gp.offset
+    A = tensor(expansion.J)
     if form.A is not None:
         mean = mean + state @ form.A.mT
         A = A + form.A
     return SecondOrderExpansion(
-        belief=Gaussian(mean, torch.diag_embed(tensor(at.variance))),
+        belief=Gaussian(mean, torch.diag_embed(tensor(expansion.variance))),
         A=A,
-        B=tensor(at.dM_du),
-        variance_by_state=tensor(at.dvariance_dx),
-        variance_by_input=tensor(at.dvariance_du),
-        mean_by_state2=tensor(at.d2M_dx2),
-        mean_by_state_input=tensor(at.d2M_dxdu),
+        B=tensor(expansion.dM_du),
+        variance_by_state=tensor(expansion.dvariance_dx),
+        variance_by_input=tensor(expansion.dvariance_du),
+        mean_by_state2=tensor(expansion.d2M_dx2),
+        mean_by_state_input=tensor(expansion.d2M_dxdu),
     )
 
 

@@ -11,7 +11,7 @@ columns of A for S vanish, because Sigma+ depends on S to second order only; whe
 Sigma+ is singular the root has no derivative, and its rows are zero in the null space.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, tensors_for, to_array
-from gpmpc.exceptions import ShapeError, check_method
+from gpmpc.exceptions import ShapeError, check_kind, check_method
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.propagation._propagator import Propagator, Sensitivity, differentiate
 
@@ -68,7 +68,10 @@ def linearize(
     See Also:
         ``gpmpc.models.linearize``, at points; ``differentiate``.
     """
-    belief = Gaussian(belief.mean.detach(), belief.covariance.detach())
+    check_kind("belief", belief, Gaussian, "a Gaussian")
+    belief = replace(
+        belief, mean=belief.mean.detach(), covariance=belief.covariance.detach()
+    )
     input = belief.mean[..., :0] if input is None else input.detach()
     if model.output_dim != belief.dim:
         raise ShapeError(
@@ -158,7 +161,7 @@ def _extended_derivatives(
     # in the basis U of the next root, entry ij of its derivative is that of dSigma+
     # over r_i + r_j
     total = next_r[..., :, None] + next_r[..., None, :]
-    inverse = (total > 0) / np.maximum(total, np.finfo(float).tiny)
+    inverse = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0)
     rotated = _congruence(next_U.mT, covariance_by)
     root_by = _congruence(next_U, rotated * inverse[..., None])
     root_by = root_by.reshape(*batch, n * n, -1)

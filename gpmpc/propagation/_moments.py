@@ -102,7 +102,7 @@ class _Point(NamedTuple):
         )
 
 
-class _Conditioned(NamedTuple):
+class _Factorized(NamedTuple):
     """I + S D for a diagonal D, through I + B with B = D^1/2 S D^1/2."""
 
     half_logdet: Tensor  # 1/2 log|I + S D| (*batch, k)
@@ -162,25 +162,25 @@ def _output_terms(model: GPPosterior, a: Any, point: _Point) -> _OutputTerms:
     D = lengthscales[:, :n] ** -2
     nu = model.features[:, :n] - point.mu[..., None, :]
     control = model.features[:, n:] - point.u[..., None, :]
-    conditioned = _condition(point.S, D)
+    factorized = _factorize(point.S, D)
     # log q_i = log sf2 - 1/2 log|I + S D| - 1/2 nu' (S + D^-1)^-1 nu - 1/2 |control|^2
     root = D.sqrt()
     whitened = torch.linalg.solve_triangular(
-        conditioned.factor, (nu * root[:, None, :]).mT, upper=False
+        factorized.factor, (nu * root[:, None, :]).mT, upper=False
     )
     certain = (control / lengthscales[:, None, n:]).square().sum(-1)
     squares = certain + whitened.square().sum(-2)
-    exponent = squares / 2 + conditioned.half_logdet[..., None]
+    exponent = squares / 2 + factorized.half_logdet[..., None]
     # cholesky_inverse has no right forward derivative
-    eye = torch.eye(n, dtype=D.dtype, device=D.device).expand_as(conditioned.factor)
-    inverse = torch.cholesky_solve(eye, conditioned.factor)
+    eye = torch.eye(n, dtype=D.dtype, device=D.device).expand_as(factorized.factor)
+    inverse = torch.cholesky_solve(eye, factorized.factor)
     G = inverse * (root[..., None, :] / root[..., :, None])
     return _OutputTerms(
         z=nu * D[:, None, :],
         q=model.signal_variance[a, None] * (-exponent).exp(),
-        half_logdet=conditioned.half_logdet,
+        half_logdet=factorized.half_logdet,
         G=G,
-        T=conditioned.T,
+        T=factorized.T,
     )
 
 
@@ -192,7 +192,7 @@ def _covariances(model: GPPosterior, pairs: _Pairs, point: _Point) -> Tensor:
     D_b = model.lengthscales[b, : model.state_dim] ** -2
     of_a = _output_terms(model, a, point)
     of_b = of_a if pairs.same else _output_terms(model, b, point)
-    joint = _condition(point.S, D_a + D_b)
+    joint = _factorize(point.S, D_a + D_b)
     T = joint.T
     r = of_a.half_logdet + of_b.half_logdet - joint.half_logdet  # (6)
     delta_i = r[..., None] - _quadratic(of_a.z, T @ (D_b[:, :, None] * of_a.T)) / 2
@@ -208,15 +208,18 @@ def _covariances(model: GPPosterior, pairs: _Pairs, point: _Point) -> Tensor:
     return V + model.signal_variance[a] - model.variance_reduction(of_a.q, a)
 
 
-def _condition(S: Tensor, D: Tensor) -> _Conditioned:
-    """Conditions I + S D: I + B is well conditioned, log1p keeps a small S's digits."""
+def _factorize(S: Tensor, D: Tensor) -> _Factorized:
+    """Factorises I + S D through I + B, B = D^1/2 S D^1/2, which is well conditioned.
+
+    log1p keeps a small S's digits.
+    """
     root = D.sqrt()
     B = root[..., :, None] * S * root[..., None, :]
     eye = torch.eye(B.shape[-1], dtype=B.dtype, device=B.device)
     half_logdet = torch.linalg.eigvalsh(B).log1p().sum(-1) / 2
     factor = torch.linalg.cholesky(B + eye)
     T = torch.cholesky_solve(B, factor) / (root[..., :, None] * root[..., None, :])
-    return _Conditioned(half_logdet=half_logdet, factor=factor, T=T)
+    return _Factorized(half_logdet=half_logdet, factor=factor, T=T)
 
 
 def _quadratic(z: Tensor, M: Tensor) -> Tensor:

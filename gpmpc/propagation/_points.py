@@ -148,13 +148,13 @@ class Unscented(NoisyPropagator):
         """
         weights = self._weights(expansion.A, n)
         eye = torch.eye(n, dtype=expansion.A.dtype, device=expansion.A.device)
-        one = math.sqrt(self._spread(n)) * eye
-        steps = torch.cat([torch.zeros_like(one[:1]), one, -one])
-        shifts = steps[:, None, None, :]  # (points, 1, 1, n)
+        columns = math.sqrt(self._spread(n)) * eye
+        # Point i is mu + root @ steps[i]: so d point_c / d root_cd = steps[i, d].
+        steps = torch.cat([torch.zeros_like(columns[:1]), columns, -columns])
 
         # (*batch, points, k, n) and (*batch, points, k, m) to (*batch, points, k, p)
         def by_parameters(by_state: Tensor, by_input: Tensor) -> Tensor:
-            by_root = by_state[..., :, None] * shifts
+            by_root = by_state[..., :, None] * steps[:, None, None, :]
             return torch.cat([by_state, by_root.flatten(-2), by_input], dim=-1)
 
         values_by = by_parameters(expansion.A, expansion.B)
@@ -164,14 +164,15 @@ class Unscented(NoisyPropagator):
         values = expansion.belief.mean  # (*batch, points, k)
         mean_by = torch.einsum("i,...iap->...ap", weights.mean, values_by)
         mean = torch.einsum("i,...ia->...a", weights.mean, values)
-        half = torch.einsum(
+        half_covariance_by = torch.einsum(
             "i,...iap,...ib->...abp",
             weights.covariance,
             values_by - mean_by[..., None, :, :],
             values - mean[..., None, :],
         )
         variance_by = torch.einsum("i,...iap->...ap", weights.mean, variances_by)
-        return mean_by, half + half.transpose(-3, -2) + on_diagonal(variance_by)
+        covariance_by = half_covariance_by + half_covariance_by.transpose(-3, -2)
+        return mean_by, covariance_by + on_diagonal(variance_by)
 
     def _spread(self, n: int) -> float:
         """Returns n + lambda: the points' squared distance in units of the root."""

@@ -212,8 +212,8 @@ def by_autograd(
 
     def step(mean: Tensor, covariance: Tensor, control: Tensor) -> tuple[Tensor, ...]:
         """Returns the k + k (k + 1) / 2 numbers to be differentiated, and all parts."""
-        at = Gaussian(mean, covariance.unflatten(-1, (n, n)))
-        result = propagator.propagate(model, at, control)
+        perturbed = Gaussian(mean, covariance.unflatten(-1, (n, n)))
+        result = propagator.propagate(model, perturbed, control)
         triangle = result.belief.covariance[..., rows, columns]
         return (
             torch.cat([result.belief.mean, triangle], dim=-1),

@@ -277,6 +277,10 @@ def test_a_frozen_model_knows_its_sizes_noise_type_and_moves():
         atol=1e-3,
     )
     assert gp.dtype == torch.float64
+    for batch in ((0,), (2, 0), (0, 3)):
+        belief = gp.predict(torch.zeros(*batch, 2), torch.zeros(*batch, 1))
+        assert belief.mean.shape == (*batch, 2)
+        assert belief.covariance.shape == (*batch, 2, 2)
     with pytest.raises(
         ShapeError, match=r"an input \(\*batch, 1\); got \(5, 2\) and \(5, 2\)"
     ):

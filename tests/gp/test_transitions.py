@@ -30,6 +30,16 @@ def test_single_precision_is_raised_to_double():
     )
 
 
+@pytest.mark.parametrize("form", [np.asarray, torch.as_tensor])
+def test_transitions_keep_their_own_numbers(form):
+    buffers = [form(np.zeros((2, 1))) for _ in range(3)]
+    data = Transitions(*buffers)
+    for buffer in buffers:
+        buffer[:] = 7.0
+    assert not data.features.any()
+    assert not data.next_states.any()
+
+
 def test_features_are_states_and_inputs_and_rows_are_chosen(transitions):
     assert torch.equal(transitions.features[:, 3:], transitions.inputs)
     assert torch.equal(transitions[[4, 1]].next_states, transitions.next_states[[4, 1]])

@@ -194,6 +194,31 @@ def test_both_transitions_of_a_glitch_are_left_out(entry, size):
     assert np.array_equal(after.noise_ratios, before.noise_ratios)
 
 
+def test_a_glitch_right_after_another_costs_no_sound_noise_ratio():
+    states, inputs = excited(30)
+    states[[21, 23], 1] += 1.0
+    before, first, resolved, second, after = taught(states, inputs)[19:24]
+    assert first.doubt is not None
+    assert resolved.doubt is None
+    assert second.doubt is not None
+    assert after.doubt is None
+    assert np.array_equal(after.noise_ratios, before.noise_ratios)
+
+
+def test_a_flight_keeps_its_own_numbers():
+    states, inputs = excited(30, wind_from=15)
+    expected = taught(states, inputs)[-1]
+    state = states[0].copy()
+    input = np.empty(1)
+    learned = LearningState.begin(ChangedModel(MODEL), state)
+    for k in range(30):  # a loop that reuses its buffers
+        state[:] = states[k + 1]
+        input[:] = inputs[k]
+        learned = learn_from_step(learned, input, state)
+    assert np.array_equal(learned.error, expected.error)
+    assert np.array_equal(learned.leads, expected.leads)
+
+
 def test_both_transitions_of_a_changed_plant_are_learned():
     states, inputs = excited(40, wind_from=20)
     steps = taught(states, inputs)
@@ -214,6 +239,9 @@ def test_a_change_that_acts_like_an_input_is_used_at_once():
     assert in_doubt.planning is in_doubt.doubt.new_plant
     assert in_doubt.size == len(MODEL) + 1
     assert not in_doubt.active
+    after_gap = in_doubt.after_gap(blown)
+    assert after_gap.planning is None
+    assert after_gap.version > in_doubt.version
     wrong = blown + np.array([0.1, 0.0])
     assert learn_from_step(learned, np.array([1.0]), wrong).planning is None
 
@@ -235,13 +263,13 @@ def test_a_plant_that_was_moved_teaches_nothing():
 def test_a_large_change_asks_for_more_confirmations():
     states, inputs = excited(20)
     learned = taught(states, inputs)[-1]
-    missing_steps = []
+    confirmations = []
     for size in (0.08, 0.3, 0.6):
         after = cart(states[-1], [1.0]) + np.array([0.1 * size, size])
         doubt = learn_from_step(learned, np.array([1.0]), after).doubt
-        missing_steps.append(doubt.missing)
-    assert missing_steps[0] == 1
-    assert missing_steps[0] < missing_steps[1] < missing_steps[2]
+        confirmations.append(doubt.confirmations_left)
+    assert confirmations[0] == 1
+    assert confirmations[0] < confirmations[1] < confirmations[2]
 
 
 def test_a_frozen_sensor_is_no_witness_of_a_change():

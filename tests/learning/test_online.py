@@ -296,3 +296,19 @@ def test_what_cannot_be_learned_is_refused():
         OnlineLearning(memory=0.0)
     with pytest.raises(UnsupportedModel, match="in host memory; got object"):
         ChangedModel(object())
+
+
+def test_a_single_precision_model_is_changed_as_well():
+    single = ChangedModel(MODEL.to(dtype=torch.float32))
+    double = ChangedModel(MODEL)
+    point = np.array([0.1, -0.2, 0.5, 0.0])
+    target = np.full(MODEL.output_dim, 0.05)
+    noise = MODEL.noise_variance.numpy()
+    x = torch.tensor([0.1, -0.2], dtype=torch.float64)
+    u = torch.tensor([0.5], dtype=torch.float64)
+    expected = double.with_point(point, target, noise).predict(x, u)
+    belief = single.with_point(point, target, noise).predict(x.float(), u.float())
+    assert belief.mean.dtype == belief.covariance.dtype == torch.float32
+    assert torch.allclose(belief.mean.double(), expected.mean, atol=1e-3)
+    assert torch.allclose(belief.covariance.double(), expected.covariance, atol=1e-4)
+    assert not torch.allclose(belief.mean, single.predict(x.float(), u.float()).mean)

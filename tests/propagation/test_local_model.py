@@ -1,12 +1,16 @@
 """s+ = A s + B u + c with s = [mu; vec(Sigma^1/2)]: against finite differences, limits,
 batches and rollouts."""
 
+from dataclasses import replace
+from functools import partial
+
 import pytest
 import torch
 
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian, square_root
 from gpmpc.propagation import MomentMatching, linearize, rollout
+from gpmpc.signals import Signals
 from tests.propagation.test_propagators import ALL, DETERMINISTIC, belief, gp, linear
 
 MODELS = {
@@ -141,6 +145,18 @@ def test_inputs_without_a_horizon_are_refused():
             rollout(MomentMatching(), gp(), belief(), inputs)
     with pytest.raises(SettingError, match="inputs: must be a torch tensor; got list"):
         rollout(MomentMatching(), gp(), belief(), [[0.1]])
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_belief_of_other_names_is_refused_by_every_door(name):
+    propagator = ALL[name]()
+    model = replace(gp(), signals=Signals(["angle", "rate"], ["torque"]))
+    u = torch.zeros(1)
+    for step in (propagator.propagate, partial(linearize, propagator)):
+        same = step(model, replace(belief(), names=("angle", "rate")), u)
+        assert same is not None
+        with pytest.raises(SettingError, match="rate, angle"):
+            step(model, replace(belief(), names=("rate", "angle")), u)
 
 
 def test_the_symmetric_root_is_semidefinite_and_squares_back():
