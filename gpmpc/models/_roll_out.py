@@ -20,6 +20,7 @@ from gpmpc._kernels.gp_rollout import (
     roll_out_gps,
 )
 from gpmpc._kernels.tape import NO_TAPE, Tape
+from gpmpc.exceptions import ShapeError
 from gpmpc.gp._backend import host_arrays
 from gpmpc.gp._posterior import AffineForm
 from gpmpc.models._features import Features
@@ -73,13 +74,17 @@ class RollOut:
 
         Returns:
             The states (T, H + 1, n) and the inputs (T, H, m).
+
+        Raises:
+            ShapeError: They do not belong to the model, or to each other.
         """
         T, H, m = feedback.inputs.shape
-        n = start.shape[1]
+        n = self._model.state_dim
         start = np.ascontiguousarray(start, dtype=float)
         if disturbance is None:
             disturbance = np.zeros(n)
         disturbance = np.ascontiguousarray(disturbance, dtype=float)
+        self._check_shapes(start, feedback.inputs, disturbance)
         if self._compiled_model is None:
             return self._stage_by_stage(start, feedback, disturbance)
         states = np.empty((T, H + 1, n))
@@ -106,13 +111,19 @@ class RollOut:
 
         Returns:
             The states (T, H + 1, n).
+
+        Raises:
+            ShapeError: They do not belong to the model, or to each other.
         """
+        inputs = np.ascontiguousarray(inputs, dtype=float)
+        if inputs.ndim != 3:
+            raise ShapeError(f"inputs must be (T, H, m); got {inputs.shape}")
         T, H, m = inputs.shape
-        n = start.shape[1]
+        n = self._model.state_dim
         unbounded = np.full((H, m), np.inf)
         no_feedback = Feedback(
             states=np.zeros((T, H, n)),
-            inputs=np.ascontiguousarray(inputs, dtype=float),
+            inputs=inputs,
             gains=np.zeros((1, H, m, n)),
             lower=-unbounded,
             upper=unbounded,
@@ -122,6 +133,18 @@ class RollOut:
         )
         states, _ = self(start, no_feedback, disturbance)
         return states
+
+    def _check_shapes(self, start: Array, inputs: Array, disturbance: Array) -> None:
+        """Raises ``ShapeError`` unless compiled code may read them unchecked."""
+        T, H, _ = inputs.shape
+        n = self._model.state_dim
+        expected = ((T, n), (T, H, self._model.input_dim), (n,))
+        got = (start.shape, inputs.shape, disturbance.shape)
+        if got != expected:
+            raise ShapeError(
+                "start (T, n), inputs (T, H, m) and disturbance (n,) must be "
+                f"{', '.join(map(str, expected))}; got {', '.join(map(str, got))}"
+            )
 
     def _stage_by_stage(
         self, start: Array, feedback: Feedback, disturbance: Array

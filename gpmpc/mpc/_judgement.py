@@ -31,7 +31,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from gpmpc._dynamics import to_array
-from gpmpc.exceptions import UnsupportedModel
+from gpmpc.exceptions import ShapeError, UnsupportedModel
 from gpmpc.mpc import _flight_checks as checks
 from gpmpc.mpc._controller import Decision, model_of
 from gpmpc.mpc._cost import Tracking
@@ -114,6 +114,9 @@ class FlightJudge:
         names: Of the states and of the inputs, for the reasons; by default their
             numbers.
 
+    Raises:
+        ShapeError: The noise is of another number of states.
+
     Attributes:
         last: Judgement of the last step.
 
@@ -135,6 +138,7 @@ class FlightJudge:
         model_noise = np.zeros(n)
         if noise is not None:
             model_noise = np.asarray(noise, dtype=float)
+            _check_shape("noise", model_noise.shape, (n,))
         self._settings = checks.Settings(
             weights=_float64(problem.cost.Q.reshape(-1, n, n)[0]),
             terminal=_float64(problem.cost.terminal),
@@ -195,10 +199,19 @@ class FlightJudge:
                 measured.
             reference: What it is to be from now on (H + 1, n), or a set point (n,).
             decision: What the controller decided on it; None where it was not called.
+
+        Raises:
+            ShapeError: One of them is of another number of states or inputs.
         """
+        n = self._no_means.shape[1]
+        measured = _float64(measured)
+        _check_shape("measured", measured.shape, (n,))
         references = _float64(reference)
         if references.ndim == 1:
             references = references[None]
+        if references.ndim != 2 or not len(references) or references.shape[1] != n:
+            got = references.shape
+            raise ShapeError(f"reference must be (H + 1, {n}) or ({n},); got {got}")
         input = self._no_input
         means = self._no_means
         covariances = self._no_covariances
@@ -206,16 +219,20 @@ class FlightJudge:
         violation = 0.0
         if decision is not None:
             input = _float64(decision.input)
+            _check_shape("decision.input", input.shape, self._no_input.shape)
             if decision.applicable:
                 means = _float64(decision.means)
                 covariances = _float64(decision.covariances)
+                stages = max(len(means), 2)  # the next state is one of them
+                _check_shape("decision.means", means.shape, (stages, n))
+                _check_shape("decision.covariances", covariances.shape, (stages, n, n))
                 # One that would have to be measured first is not worth the time here.
                 if not callable(decision.plan_novelty):
                     novelty = float(decision.plan_novelty)
                 if self._constrained:
                     violation = float(decision.violation)
         reading = checks.Reading(
-            measured=_float64(measured),
+            measured=measured,
             reference=references,
             last_means=self._means,
             last_covariances=self._covariances,
@@ -268,6 +285,12 @@ def _learned_noise(controller: Any) -> Array | None:
 
 
 _ALL_WELL = Judgement()
+
+
+def _check_shape(name: str, got: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    """Raises ``ShapeError`` unless compiled code may read an array unchecked."""
+    if got != expected:
+        raise ShapeError(f"{name} must be {expected}; got {got}")
 
 
 def _float64(values: Any) -> Array:

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from gpmpc._kernels.gp_rollout import Feedback
+from gpmpc.exceptions import ShapeError
 from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, DisturbedModel, ResidualModel, RollOut, linearize
 
@@ -144,3 +145,20 @@ def test_integer_starts_and_strided_disturbances_are_taken():
     )
     for start in (np.array([[1, 0, 1]]), np.array([[1.0, 0.0, 1.0]])):
         assert np.array_equal(roll_out.open_loop(start, inputs, wide[:, 0]), expected)
+
+
+@pytest.mark.parametrize("kind", ["differences", "a nominal model in torch"])
+def test_arrays_of_other_sizes_are_refused(kind):
+    roll_out = RollOut(MODELS[kind]())
+    start = np.zeros((2, 3))
+    inputs = np.zeros((2, 4, 2))
+    for mistake in (
+        (start[:, :2], inputs),
+        (np.zeros((2, 4)), inputs),
+        (start[:1], inputs),
+        (start, inputs[..., :1]),
+        (start, inputs[0]),
+        (start, inputs, np.zeros(1)),
+    ):
+        with pytest.raises(ShapeError, match=r"start \(T, n\), inputs|\(T, H, m\)"):
+            roll_out.open_loop(*mistake)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.judgement import Frozen, Late, Reversed, tank
+from gpmpc.exceptions import ShapeError
 from gpmpc.gp.casadi_ import successor_function
 from gpmpc.models import CasadiFunction, KnownModel
 from gpmpc.mpc import (
@@ -378,3 +379,16 @@ def test_a_flight_is_what_its_steps_say():
     assert of([well, gone, well]) == back
     assert str(odd) == "suspicious: a"
     assert str(well) == "healthy"
+
+
+def test_arrays_of_other_sizes_are_refused():
+    problem = Problem(Tracking([1.0, 1.0], [0.1]))
+    with pytest.raises(ShapeError, match=r"noise must be \(2,\); got \(1,\)"):
+        FlightJudge(problem, noise=[0.1])
+    judge = FlightJudge(problem)
+    state = np.zeros(2)
+    with pytest.raises(ShapeError, match=r"measured must be \(2,\); got \(3,\)"):
+        judge.judge(np.zeros(3), state, None)
+    for reference in (np.zeros(1), np.zeros((4, 3)), np.zeros((0, 2))):
+        with pytest.raises(ShapeError, match="reference must be"):
+            judge.judge(state, reference, None)
