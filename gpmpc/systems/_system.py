@@ -361,7 +361,7 @@ class System:
 
     def _check_length(self, method: str, entries: Any) -> Any:
         n = len(self.dynamics.state_names)
-        count: Any = type(entries).__name__
+        count: int | str = type(entries).__name__
         if hasattr(entries, "__len__"):
             count = len(entries)
         if count != n:

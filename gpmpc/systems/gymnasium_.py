@@ -204,12 +204,10 @@ def make_environment(system: System | str, **settings: Any) -> Any:
         ) -> tuple[Array, dict]:
             """Starts where the system starts, or from its region."""
             super().reset(seed=seed)
-            region: Any = flown.region if flown.start is None else None
-            start: Any = flown.start or flown.goal
-            if region is not None:
-                lower, upper = region
-                start = self.np_random.uniform(lower, upper)
-            self.state = np.array(start, dtype=float)
+            self.state = np.array(flown.start or flown.goal, dtype=float)
+            if flown.start is None and flown.region is not None:
+                lower, upper = flown.region
+                self.state = self.np_random.uniform(lower, upper)
             self._limit = max(flown.lost_from(flown.unit), 1.001 * self._distance())
             return self.state.copy(), {}
 
