@@ -202,7 +202,8 @@ static real continued_mean(const gpmpc_controller *controller, const real *state
     return mean;
 }
 
-/* Reads the reference; its angles move by full turns towards the last plan. */
+/* Reads the reference; its angles move by full turns towards the last plan, or without
+   one towards the stage before. */
 static void read_reference(gpmpc_controller *controller, const real *state,
                            const gpmpc_reference *reference)
 {
@@ -213,7 +214,7 @@ static void read_reference(gpmpc_controller *controller, const real *state,
         for (a = 0; a < GPMPC_COST_ANGLE_COUNT; a++) {
             real plan;
             i = cost_angles[a];
-            plan = state[i];
+            plan = k > 0 ? problem->targets[k - 1][i] : state[i];
             if (k > 0 && controller->has_plan)
                 plan = continued_mean(controller, state, k, i, cost_angles,
                                       GPMPC_COST_ANGLE_COUNT);
@@ -656,16 +657,15 @@ static real largest_violation(const gpmpc_problem *problem)
 /* Whether the plan keeps the hard rows of the states, nearly. */
 static int keeps_hard_rows(const gpmpc_problem *problem)
 {
-    real total = 0;
     int k, e;
     for (k = 0; k < H; k++)
         for (e = 0; e < r; e++) {
             real miss =
                 row_miss(problem, k, e, problem->states[k + 1], problem->inputs[k]);
-            if (row_prices[e] > LARGEST && miss > 0)
-                total += miss;
+            if (row_prices[e] > LARGEST && !(miss <= FEASIBLE))
+                return 0;
         }
-    return total <= FEASIBLE;
+    return 1;
 }
 
 /* ------------------------------------------------------------------------------------
@@ -1225,7 +1225,7 @@ typedef struct {
    and violations V0 of the plan without them,
    least price = 2 (J + ..) / V0,   J0 <= J <= 2 J0,   extra cost = (J0 + ..) / 10 */
 static elastic_limits limits_of_price(const gpmpc_problem *problem, const real *misses,
-                                      real free_cost, real last_cost)
+                                      real free_cost, real last_cost, real exact_price)
 {
     elastic_limits limits;
     real cost = smaller(larger(free_cost, last_cost), 2 * free_cost);
@@ -1246,6 +1246,8 @@ static elastic_limits limits_of_price(const gpmpc_problem *problem, const real *
                 weight += g[i] * dot(Q + i * n, g, n);
                 largest = larger(largest, Q[i * n + i]);
             }
+            if (!(largest > 0))
+                largest = exact_price / REAL(1e6);
             square = dot(g, g, n);
             largest *= square; /* counts where the cost does not weigh the direction */
             if (!(weight > REAL(1e-12) * largest))
@@ -1284,8 +1286,8 @@ static real cost_when_followed(gpmpc_controller *controller,
     return cost_of_plan(problem, states, inputs);
 }
 
-/* Solves the program for the highest price of elastic rows whose plan is affordable: the
-   exact one, or one of a few between the least and that; the least where none is. */
+/* Solves the program for the highest price of elastic rows whose plan is affordable:
+   the exact one, or one of a few between the least and that; the least where none is. */
 static void raise_elastic_price(gpmpc_controller *controller, real least_price,
                                 real highest, real affordable_cost)
 {
@@ -1330,7 +1332,7 @@ static void solve_elastic(gpmpc_controller *controller)
     real inputs[GPMPC_SIZE];
     real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
     real last_cost, affordable_cost;
-    real highest = 0;
+    real highest = 0; /* price */
     int e;
     if (solution->status != GPMPC_SOLVED)
         return;
@@ -1343,10 +1345,14 @@ static void solve_elastic(gpmpc_controller *controller)
     last_cost = cost_of_plan(problem, &problem->states[0][0], &problem->inputs[0][0]);
     set_elastic_price(problem, REAL(1e-9)); /* next to nothing: rows keep their place */
     solve(problem, &controller->program, solution, without);
+    if (without->status != GPMPC_SOLVED) {
+        set_elastic_price(problem, highest);
+        return;
+    }
     expand(problem, without->x, inputs, states);
     write_misses(problem, without, misses);
     limits = limits_of_price(problem, misses, cost_of_plan(problem, states, inputs),
-                             last_cost);
+                             last_cost, highest);
     if (!problem->has_feedback)
         write_gains(problem);
     affordable_cost = INFINITY;
@@ -1356,7 +1362,7 @@ static void solve_elastic(gpmpc_controller *controller)
         raise_elastic_price(controller, limits.least_price, highest, affordable_cost);
         return;
     }
-    set_elastic_price(problem, limits.least_price);
+    set_elastic_price(problem, smaller(limits.least_price, highest));
     solve(problem, &controller->program, solution, solution);
 }
 #endif
@@ -1554,6 +1560,7 @@ static int continue_last_plan(gpmpc_controller *controller)
     }
     if (GPMPC_HOLDS)
         copy(controller->input, controller->inputs[0], m);
+    keep_bounds(controller, controller->inputs[0]); /* bounds may change by stage */
     return admit(controller, &controller->inputs[0][0]);
 }
 

@@ -200,6 +200,8 @@ def _rows_of(
     """Returns the rows of one constraint."""
     F, lower, upper = constraint.rows(horizon)
     if constraint.stages is not None:
+        lower = lower.copy()  # either may be a view of what the constraint holds
+        upper = upper.copy()
         _leave_out_other_stages(tuple(constraint.stages), lower, upper)
     r = len(F)
     kappa = 0.0

@@ -397,7 +397,7 @@ class Request(NamedTuple):
         targets = _read_targets(reference, state, horizon, n)
         target_inputs = _read_target_inputs(reference, horizon, m)
         kappas = _read_kappas(reference)
-        last_decision = previous if _can_continue(previous, horizon, m) else None
+        last_decision = previous if _can_continue(previous, horizon, n, m) else None
         last_input = _read_last_input(previous, initial_input)
         states = None
         if plan is not None:
@@ -485,20 +485,24 @@ def _check_finite(name: str, values: Array) -> None:
         raise DataError(f"reference {name} must be finite; got {got}")
 
 
-def _can_continue(previous: Decision | None, horizon: int, m: int) -> bool:
+def _can_continue(previous: Decision | None, horizon: int, n: int, m: int) -> bool:
     """Returns whether a decision has a plan of this horizon to start from."""
     if previous is None or not previous.applicable:
         return False
-    return np.shape(previous.inputs) == (horizon, m)
+    has_inputs = np.shape(previous.inputs) == (horizon, m)
+    return has_inputs and np.shape(previous.means) == (horizon + 1, n)
 
 
 def _read_last_input(previous: Decision | None, initial_input: Array) -> Array:
     """Returns the input before this step (m,): the initial one where it is unknown."""
-    if previous is not None:
-        last_input = _as_array(previous.input)
-        if _is_finite(last_input):
-            return last_input
-    return _as_array(initial_input)
+    initial_input = _as_array(initial_input)
+    if previous is None:
+        return initial_input
+    last_input = _as_array(previous.input)
+    if last_input.shape != initial_input.shape:
+        rule = f"input of the last decision must have shape {initial_input.shape}"
+        raise ShapeError(f"{rule}; got {last_input.shape}")
+    return last_input if _is_finite(last_input) else initial_input
 
 
 def one_step_on(rows: Array) -> Array:
@@ -629,11 +633,17 @@ def _unwrap(
 ) -> Array:
     """Returns references (H + 1, n) whose angles are moved by full turns.
 
-    They move towards the last plan, or towards the state where there is none.
+    They move towards the last plan. Where there is none, no stage is further than half
+    a turn from the stage before, and the first one than that from the state.
     """
-    plan = np.tile(state, (len(targets), 1))
-    if previous is not None:
-        plan[1:] = continued_means(previous, state, angles)
+    if previous is None:
+        before = state
+        turned = targets.copy()
+        for target in turned:
+            target += full_turns(before - target, angles)
+            before = target
+        return turned
+    plan = np.concatenate([state[None], continued_means(previous, state, angles)])
     return targets + full_turns(plan - targets, angles)
 
 

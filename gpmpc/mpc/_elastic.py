@@ -40,15 +40,23 @@ NO_PRICE = 1e-9  # of a row that does not count: it keeps its place among the ot
 _TINY = 1e-12
 
 
-def violations(local: LocalProblem, elastic: Array) -> Array:
-    """Returns by how much a plan misses each elastic row (H, r), zero where kept."""
+def violations(local: LocalProblem, chosen: Array) -> Array:
+    """Returns by how much a plan misses chosen ones of its rows, zero where kept.
+
+    Args:
+        local: With the plan.
+        chosen: Which of the r rows (r,).
+
+    Returns:
+        The violations (H, number of chosen rows).
+    """
     E, D, lower, upper = local.rows
     states = local.plan.states[1:]
     values = np.einsum("kri,ki->kr", _by_stage(E, len(states)), states)
     if len(D):
         values = values + np.einsum("krj,kj->kr", D, local.plan.inputs)
     outside = np.maximum(values - upper, lower - values)
-    return np.maximum(0.0, outside)[:, elastic]
+    return np.maximum(0.0, outside)[:, chosen]
 
 
 class ElasticLimits(NamedTuple):
@@ -69,6 +77,7 @@ def elastic_limits(
     last_cost: float,
     elastic: Array,
     Q: Array,
+    largest_weight: float,
 ) -> ElasticLimits:
     """Returns the limits of the price of elastic rows, from the plan without them.
 
@@ -78,6 +87,7 @@ def elastic_limits(
         last_cost: Of the last plan.
         elastic: Which of the r rows are elastic (r,).
         Q: Weight of the states (n, n), or of those of each stage (H, n, n).
+        largest_weight: Of the whole cost, which counts where Q is zero.
     """
     missed = violations(local, elastic)
     gradients = _by_stage(local.rows.E, len(missed))
@@ -87,7 +97,8 @@ def elastic_limits(
     weights = np.einsum("kri,kij,krj->kr", gradients, of_stages, gradients)
     squares = (gradients**2).sum(axis=2)
     diagonals = np.diagonal(of_stages, axis1=1, axis2=2)
-    largest = diagonals.max(axis=1, keepdims=True) * squares
+    largest = diagonals.max(axis=1, keepdims=True)
+    largest = np.where(largest > 0.0, largest, largest_weight) * squares
     weights = np.where(weights > _TINY * largest, weights, largest)
     # The cheapest move by a violation v along a gradient g has the size v / |g|.
     moving_costs = weights / np.maximum(squares, _TINY) ** 2 * missed**2

@@ -438,6 +438,8 @@ def _continue_last_plan(
     plan = last.plan
     inputs = one_step_on(plan.inputs)
     first = last.input if on_failure == "hold" else inputs[0]
+    # bounds may change from stage to stage
+    first = _within_bounds(controller, first, last.input)
     shifted = replace(
         _with_first(plan, inputs, first),
         means=one_step_on(plan.means),

@@ -40,7 +40,6 @@ from gpmpc.exceptions import SettingError, check_method, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import DelayedModel
 from gpmpc.mpc._condense import condense
-from gpmpc.mpc._constraints import price_violations
 from gpmpc.mpc._controller import (
     FEASIBLE,
     KEPT,
@@ -69,7 +68,7 @@ from gpmpc.mpc._novelty import data_scales, novelty_of, novelty_when_read
 from gpmpc.mpc._roll_out import close_defects, cost_of_inputs, cost_when_followed
 from gpmpc.mpc._sqp import FAILURES, Globalization, Iterate, measure_continuity
 from gpmpc.mpc._stability import Stability, stability
-from gpmpc.mpc.problem import Problem
+from gpmpc.mpc.problem import EXACT, Problem
 from gpmpc.propagation import Propagator
 from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
 from gpmpc.signals import Signals
@@ -563,7 +562,8 @@ class _ControlStep:
     def _solve(self, program: CondensedProgram, local: LocalProblem) -> QPSolution:
         """Returns the solution of a program, warm-started from the last one.
 
-        Elastic rows that the first program cannot keep get another price.
+        Elastic rows that the first program cannot keep get another price, which later
+        programs of the step keep.
         """
         solution = self._solve_priced(program, self._warm_start, self._row_prices)
         constraints = self._prediction.constraints
@@ -619,8 +619,11 @@ class _ControlStep:
         references = self._request.references
         elastic = self._prediction.constraints.elastic
         prices = self._prediction.constraints.prices.copy()
+        exact_price = float(prices[elastic].max())
         prices[elastic] = NO_PRICE
         free_solution = self._solve_priced(program, solution, prices)
+        if not free_solution.status.solved:
+            return solution
         free = self._planned(program, free_solution, local)
         limits = elastic_limits(
             free,
@@ -628,6 +631,7 @@ class _ControlStep:
             last_cost=float(local.stage_costs(references).sum()),
             elastic=elastic,
             Q=self._prediction.problem.cost.Q,
+            largest_weight=exact_price / EXACT,
         )
         if self._request.previous is not None:
             free_cost = self._cost_when_followed(program, free_solution, local)
@@ -636,7 +640,7 @@ class _ControlStep:
                 return self._raise_elastic_price(
                     program, solution, local, limits.least_price, affordable_cost
                 )
-        prices[elastic] = limits.least_price
+        prices[elastic] = min(limits.least_price, exact_price)
         self._row_prices = prices
         return self._solve_priced(program, solution, prices)
 
@@ -661,6 +665,8 @@ class _ControlStep:
         price = min(least_price, highest_price)
         best = None
         for _ in range(TRIALS):
+            if self._controller._is_late(self._stopwatch):
+                break
             middle = math.sqrt(price * highest_price)
             prices[elastic] = middle
             trial = self._solve_priced(program, best or solution, prices)
@@ -864,8 +870,8 @@ class _ControlStep:
     def _keeps_hard_rows(self, local: LocalProblem) -> bool:
         """Returns whether a plan keeps hard rows of the states, nearly."""
         prices = self._prediction.constraints.prices
-        hard = np.where(np.isinf(prices), np.inf, 0.0)
-        return price_violations(hard, local.rows, local.plan, 1.0) <= FEASIBLE
+        misses = violations(local, np.isinf(prices))
+        return bool(misses.max(initial=0.0) <= FEASIBLE)
 
     def _novelty(
         self, local: LocalProblem, means: Array, inputs: Array, covariances: Array

@@ -46,7 +46,7 @@ Array = np.ndarray
 
 # The exact price, in the cost's largest weight: more than any multiplier that a
 # bound is worth.
-_EXACT = 1e6
+EXACT = 1e6
 
 
 class ConstraintSides(NamedTuple):
@@ -119,7 +119,7 @@ class Constraint:
 
     def standard_deviations(self, sides: int = 1) -> float:
         """Returns kappa of each of a number of sides, all stages counted."""
-        if self.kappa is not None or self.probability is None:
+        if self.kappa is not None or self.probability is None or sides == 0:
             return float(self.kappa or 0.0)
         risk = 1.0 - self.probability
         return NormalDist().inv_cdf(1.0 - risk / (sides if self.joint else 1))
@@ -491,4 +491,4 @@ class Problem:
         cost = self.cost
         weights = [cost.Q, cost.terminal, cost.R]
         weights += [output.weight for output in self.outputs]
-        return _EXACT * float(max(np.linalg.eigvalsh(W).max() for W in weights))
+        return EXACT * float(max(np.linalg.eigvalsh(W).max() for W in weights))
