@@ -59,8 +59,10 @@ class DisturbedModel(LinearWrapper):
         check_like("effect", self.effect, self.model)
         q = self.effect.shape[1]
         check_numbers("std", self.std, q, least=0)
-        object.__setattr__(self, "decay", list(self.decay) or [1.0] * q)
+        if hasattr(self.decay, "__len__") and not len(self.decay):
+            object.__setattr__(self, "decay", [1.0] * q)
         check_numbers("decay", self.decay, q)
+        object.__setattr__(self, "decay", list(self.decay))
         if any(abs(phi) > 1 for phi in self.decay):
             raise SettingError("decay", f"must lie between -1 and 1; got {self.decay}")
 

@@ -119,9 +119,9 @@ class Features:
             The features (K, d), the selected inputs (K, m_s), and the derivative of
             each feature by its state (K, d); None where all of these are one.
         """
-        features = states[:, self.columns]
+        features = states[:, self.columns].astype(float)
         selected_inputs = inputs[:, self._input_columns]
-        if not self.angles:
+        if not len(self.sines):
             return features, selected_inputs, None
         sines = self.sines
         sine = np.sin(features[:, sines])

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc._angles import wrap
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.models._namings import NO_NAMINGS, Namings, order_by_name
@@ -241,9 +242,14 @@ class SystemNominal:
         x = [states[..., i] for i in self._state_order]
         u = [inputs[..., i] for i in self._input_order]
         after = system.successor(x, u)
+        # a derivative does not wrap its angles; a user's successor may
+        wraps = not hasattr(system.dynamics, "derivative")
         rates: list[Any] = [None] * len(x)
         for entry, (now, then) in enumerate(zip(x, after, strict=True)):
-            rates[self._state_order[entry]] = (then - now) / self.time_step
+            change = then - now
+            if wraps and entry in system.angle_indices:
+                change = wrap(change)
+            rates[self._state_order[entry]] = change / self.time_step
         return np.stack(np.broadcast_arrays(*rates), axis=-1)
 
 

@@ -7,16 +7,23 @@ import torch
 from torch import Tensor
 
 from gpmpc._dynamics import check_destination
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import SettingError, UnsupportedModel
 from gpmpc.models._nominal import Affine
 
 
 def move(model: Any, device: Any = None, dtype: torch.dtype | None = None) -> Any:
-    """Copies a model to another device or type; functions are taken as they are."""
+    """Copies a model to another device or type; functions are taken as they are.
+
+    Raises:
+        UnsupportedModel: A part is a model that exists in float64 on the host alone.
+    """
     check_destination(device, dtype)
     parts = {field.name: getattr(model, field.name) for field in fields(model)}
     for name, part in parts.items():
         if isinstance(part, Tensor) or hasattr(part, "state_dim"):
+            if not hasattr(part, "to"):
+                kind = type(part).__name__
+                raise UnsupportedModel(f"{kind} has no to(): it cannot be moved")
             parts[name] = part.to(device=device, dtype=dtype)
         elif isinstance(part, Affine):
             parts[name] = move(part, device, dtype)

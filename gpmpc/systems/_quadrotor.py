@@ -213,15 +213,16 @@ def translational(
     See Also:
         ``rotational``, the other half; ``coupled``.
     """
+    dynamics = Translational(**parameters)
     return System(
-        Translational(**parameters),
+        dynamics,
         time_step,
         substeps,
         name="translational",
         units=_POSITION_UNITS | {"U1": "N", "ux": "1", "uy": "1"},
         input_lower=(0.0, -0.7, -0.7),
         input_upper=(100.0, 0.7, 0.7),
-        initial_input=(7.26, 0.0, 0.0),  # the weight m g
+        initial_input=(_weight(dynamics.mass), 0.0, 0.0),
         region=((-20.0, -2.0) * 3, (20.0, 2.0) * 3),
         pose=_POSITION,
         **_FOLLOWS_POSITIONS,
@@ -282,11 +283,16 @@ def coupled(
         | dict.fromkeys(("U1", "U2", "U3", "U4"), "N"),
         input_lower=(0.0, -2.0, -2.0, -2.0),
         input_upper=(20.0, 2.0, 2.0, 2.0),
-        initial_input=(7.26, 0.0, 0.0, 0.0),  # the weight m g
+        initial_input=(_weight(mass), 0.0, 0.0, 0.0),
         region=((-2.0, -1.0) * 3 + (-0.3, -0.5) * 3, (2.0, 1.0) * 3 + (0.3, 0.5) * 3),
         pose=_POSITION | _ATTITUDE,
         **_FOLLOWS_POSITIONS,
     )
+
+
+def _weight(mass: float) -> float:
+    """Returns the thrust that carries a mass [N]; the paper rounds it, to 7.26."""
+    return 7.26 * (mass / 0.74)
 
 
 def thrust_direction(phi: Any, theta: Any, psi: Any) -> tuple[Any, Any, Any]:

@@ -169,6 +169,8 @@ class System:
                 raise SettingError(key, f"must be a list of names; got {value!r}")
         _check_mapping("rates", self.rates)
         _check_mapping("pose", self.pose)
+        self._set("rates", dict(self.rates))
+        self._set("pose", dict(self.pose))
         self._set("angles", tuple(self.angles))
         self._set("tracked", tuple(tracked))
         for key, names in (
@@ -233,7 +235,7 @@ class System:
             )
         if self.region is None:
             return
-        if len(self.region) != 2:
+        if not hasattr(self.region, "__len__") or len(self.region) != 2:
             raise SettingError(
                 "region",
                 f"must be the smallest and the largest states; got {self.region!r}",
@@ -475,7 +477,8 @@ def step_many(plant: System, states: Array, inputs: Array) -> Array:
     m = len(plant.input_names)
     states = read_array("states", states, plant.state_names)
     inputs = read_array("inputs", inputs, plant.input_names)
-    if states.shape != (len(inputs), n) or inputs.shape != (len(states), m):
+    are_tables = states.ndim == inputs.ndim == 2
+    if not are_tables or states.shape[1] != n or inputs.shape != (len(states), m):
         raise ShapeError(
             f"states and inputs must be (T, {n}) and (T, {m}); "
             f"got {states.shape} and {inputs.shape}"

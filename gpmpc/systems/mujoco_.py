@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc.exceptions import DataError, SettingError
+from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.systems._simulators import Simulator, library, numbers
 from gpmpc.systems._system import System
 
@@ -111,11 +111,13 @@ class _Joints(_Model):
         control = np.zeros((count, self.substeps, model.nu))
         control[:, :, self.controls] = inputs.T[:, None]
         next_states = np.full(states.shape, np.nan)
-        if np.isfinite(initial).all() and np.isfinite(control).all():
+        # MuJoCo stops at the first number that is not finite.
+        finite = np.isfinite(states).all(axis=0) & np.isfinite(inputs).all(axis=0)
+        if finite.any():
             trajectories, _ = library("mujoco.rollout").rollout(
-                model, self.data, initial, control
+                model, self.data, initial[finite], control[finite]
             )
-            next_states = trajectories[:, -1, self._order].T
+            next_states[:, finite] = trajectories[:, -1, self._order].T
         return next_states[:, 0] if single else next_states
 
 
@@ -150,6 +152,7 @@ class _Sensors(_Model, Simulator):
         )
         self._observe = observe
         self.substeps = substeps
+        check_number("input_delay", input_delay, least=0, whole=True)
         self._delay = input_delay
         self.state_names = tuple(state_names or _value_names(sensors, sizes))
         self.input_names = tuple(actuators)
@@ -216,13 +219,16 @@ def mujoco_system(
     Raises:
         DataError: The file is no MJCF model.
         SettingError: A name is not there, a joint is no hinge or slide or is left out,
-            or both joints and sensors are named, or neither.
+            or both joints and sensors are named, or neither; or an observation is of
+            joints.
     """
     if bool(joints) == bool(sensors):
         raise SettingError(
             "joints, sensors",
             "name either the joints or the sensors that are the state",
         )
+    if joints and observation:
+        raise SettingError("observation", "is of sensors; got it beside joints")
     if joints:
         dynamics: _Joints | _Sensors = _Joints(path, joints, actuators, substeps)
         settings = {"rates": {f"{name}_rate": name for name in joints}} | settings

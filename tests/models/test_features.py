@@ -17,6 +17,7 @@ from gpmpc.gp.casadi_ import casadi_function, successor_function
 from gpmpc.models import (
     Affine,
     CasadiFunction,
+    Features,
     Lags,
     ResidualModel,
     load_model,
@@ -160,6 +161,17 @@ def test_turns_and_left_out_columns_change_nothing():
     after = model.predict(turn, u)
     assert torch.allclose(after.mean - turn, prediction.mean - x, atol=1e-12)
     assert torch.allclose(after.covariance, prediction.covariance, atol=1e-12)
+
+
+def test_angles_of_an_array_and_whole_numbers_are_what_they_say():
+    listed = Features([0, 1], [0], [0], state_dim=2, input_dim=1)
+    counted = Features([0, 1], [0], np.array([0]), state_dim=2, input_dim=1)
+    states = np.array([[2, 3], [0, 1]])
+    inputs = np.zeros((2, 1))
+    for features in (listed, counted):
+        values, _, slopes = features.linearize(states, inputs)
+        np.testing.assert_allclose(values[0], [np.sin(2), np.cos(2), 3])
+        np.testing.assert_allclose(slopes[0], [np.cos(2), -np.sin(2), 1])
 
 
 @pytest.mark.parametrize(

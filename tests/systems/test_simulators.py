@@ -182,6 +182,11 @@ def test_mujoco_joints_and_sensors_agree_for_one_and_for_many(cart, rng):
     states, inputs = 0.1 * rng.normal(size=(7, 4)), rng.normal(size=(7, 1))
     alone = [step(joints, x, u) for x, u in zip(states, inputs, strict=True)]
     assert np.array_equal(step_many(joints, states, inputs), alone)
+    states[2, 1] = np.inf
+    others = np.arange(7) != 2
+    together = step_many(joints, states, inputs)
+    assert np.array_equal(together[others], np.array(alone)[others])
+    assert np.isnan(together[2]).all()
     assert len(RandomData(samples=20, starts="start").transitions(joints)) == 20
 
 
@@ -264,6 +269,20 @@ def test_misuse_of_simulators_is_one_clear_line(cart, tmp_path, monkeypatch):
             lambda: mujoco_system(cart, ["push"], joints=["slider"]),
             SettingError,
             "must name all 2 joints",
+        ),
+        (
+            lambda: mujoco_system(
+                cart, ["push"], ["slider", "hinge"], observation={"input_delay": 2}
+            ),
+            SettingError,
+            "observation: is of sensors",
+        ),
+        (
+            lambda: mujoco_system(
+                cart, ["push"], sensors=["angle"], observation={"input_delay": -1}
+            ),
+            SettingError,
+            "input_delay: must be a whole number",
         ),
         (
             lambda: mujoco_system(cart, ["push"]),

@@ -223,6 +223,7 @@ def test_a_trajectory_gives_the_tracked_states_and_their_rates():
             SettingError,
             "region: must be the smallest and the largest states",
         ),
+        ({"region": 3.0}, SettingError, "region: must be the smallest and the largest"),
         (
             {"nominal": pendulum()},
             SettingError,
@@ -248,6 +249,25 @@ def test_a_trajectory_of_another_number_of_positions_is_refused():
         "got positions of 3 numbers",
     ):
         pendulum().reference_states(Hover([0, 0, 0]), 3)
+
+
+def test_a_quadrotor_of_another_mass_begins_with_its_own_weight():
+    assert coupled().initial_input[0] == translational().initial_input[0] == 7.26
+    assert coupled(mass=1.0).initial_input[0] == pytest.approx(9.81, rel=1e-3)
+    assert translational(mass=1.0).initial_input[0] == pytest.approx(9.81, rel=1e-3)
+
+
+def test_a_system_keeps_what_it_was_checked_with():
+    rates = {"speed": "position"}
+    system = System(Spring(), 0.1, rates=rates)
+    rates["speed"] = "nothing"
+    assert system.rates == {"speed": "position"}
+
+
+@pytest.mark.parametrize("inputs", [0.0, [0.0], [[0.0, 1.0]]])
+def test_many_steps_take_tables_alone(inputs):
+    with pytest.raises(ShapeError, match=r"must be \(T, 4\) and \(T, 1\)"):
+        step_many(cart_pole(), [[0.0] * 4], inputs)
 
 
 def test_random_data_are_the_systems_own_within_its_limits():
