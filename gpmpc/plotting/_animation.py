@@ -26,7 +26,9 @@ from gpmpc.plotting._style import (
     PLAN,
     REFERENCE,
     TUBE,
+    broken,
     check_run,
+    gaps_of,
     styled,
 )
 
@@ -119,7 +121,16 @@ class _Flight:
     is_planned: Array  # (K, H + 1) whether the plan has that stage
     failed: Array  # (K,) whether the plan was not applied
     distances: Array  # (K,) from the reference [cm]
+    gaps: Array  # rows before which steps are lost
     height_name: str
+
+    def line(self, values: Array, last: int | None = None) -> Array:
+        """Returns values (K, ...) of a line, broken where steps are lost.
+
+        ``last`` is the row that it ends with; by default it is drawn to the end.
+        """
+        end = len(values) if last is None else last + 1
+        return broken(values[:end], self.gaps[self.gaps < end])
 
 
 def _read_flight(run: "Run") -> _Flight:
@@ -142,6 +153,7 @@ def _read_flight(run: "Run") -> _Flight:
         is_planned=np.isfinite(plans[..., 0]) & np.isfinite(plans[..., 1]),
         failed=run.failed,
         distances=100 * np.linalg.norm(errors, axis=1),
+        gaps=gaps_of(run),
         height_name="z" if z_is_up else "-z",
     )
 
@@ -211,7 +223,7 @@ class _MapPanel:
         self.axis = axis
         self._flight = flight
         axis.plot(
-            *flight.reference_positions.T,
+            *flight.line(flight.reference_positions).T,
             color=REFERENCE,
             linewidth=1,
             linestyle=DASHED,
@@ -224,7 +236,7 @@ class _MapPanel:
 
     def draw(self, k: int) -> None:
         """Draws step k."""
-        self.flown.set_data(*self._flight.positions[: k + 1].T)
+        self.flown.set_data(*self._flight.line(self._flight.positions, k).T)
         self.plan.set_data(*self._flight.plans[k].T)
         self.vehicle.set_data(*self._flight.positions[k : k + 1].T)
 
@@ -235,8 +247,8 @@ class _HeightPanel:
     def __init__(self, axis: Axes, flight: _Flight):
         self._flight = flight
         (self.reference,) = axis.plot(
-            flight.times,
-            flight.reference_heights,
+            flight.line(flight.times),
+            flight.line(flight.reference_heights),
             color=REFERENCE,
             linewidth=1,
             linestyle=DASHED,
@@ -246,7 +258,10 @@ class _HeightPanel:
 
     def draw(self, k: int) -> None:
         """Draws the flight up to step k."""
-        self.flown.set_data(self._flight.times[: k + 1], self._flight.heights[: k + 1])
+        flight = self._flight
+        self.flown.set_data(
+            flight.line(flight.times, k), flight.line(flight.heights, k)
+        )
 
 
 class _WidthPanel:

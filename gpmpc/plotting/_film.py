@@ -17,7 +17,14 @@ from matplotlib.figure import Figure
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, UnsupportedModel
 from gpmpc.plotting._animation import check_file, save_animation
-from gpmpc.plotting._style import FLOWN, PLAN, REFERENCE, check_run
+from gpmpc.plotting._style import (
+    FLOWN,
+    PLAN,
+    REFERENCE,
+    broken,
+    check_run,
+    gaps_of,
+)
 
 if TYPE_CHECKING:
     from gpmpc.recording import Run
@@ -169,6 +176,7 @@ class _Scene:
         self.axes: list[int] = []
         if {"x", "y", "z"} <= run.pose.keys():
             self.axes = [run.pose[axis] for axis in "xyz"]
+        self._gaps = gaps_of(run)
         stride = max(1, len(run.times) // _FEWEST_REFERENCES)
         self._reference_path = run.references[::stride][:, self.axes]
 
@@ -229,16 +237,20 @@ class _Scene:
 
     def _add_paths(self, k: int) -> None:
         """Adds the reference, the path flown so far, and the plan."""
-        flown_path = self._run.states[max(0, k - _TRAIL) : k + 1, self.axes]
+        first = max(0, k - _TRAIL)
+        breaks = self._gaps[(self._gaps > first) & (self._gaps <= k)] - first
+        flown_path = broken(self._run.states[first : k + 1, self.axes], breaks)
         planned_path, _ = self._plan(k)
         self._add_path(self._reference_path, REFERENCE)
         self._add_path(flown_path, FLOWN)
         self._add_path(planned_path, PLAN)
 
     def _add_path(self, points: Array, colour: str) -> None:
-        """Adds thin rods from point to point."""
+        """Adds thin rods from point to point; none from or to a point that is NaN."""
         capsule = self._mujoco.mjtGeom.mjGEOM_CAPSULE
         for begin, end in pairwise(points):
+            if not np.isfinite([begin, end]).all():
+                continue
             rod = self._add_shape(
                 capsule,
                 size=np.zeros(3),

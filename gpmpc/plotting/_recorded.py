@@ -23,8 +23,10 @@ from gpmpc.plotting._style import (
     SKY,
     TUBE,
     VERMILION,
+    broken,
     check_run,
     figure_label,
+    gaps_of,
     legend_below,
     make_figure,
     name_of,
@@ -158,7 +160,7 @@ def _tracked_states(run: "Run") -> list[_Tracked]:
             _Tracked(
                 title=name_of(name, unit, z_is_down),
                 unit=unit,
-                gaps=_gaps(run),
+                gaps=gaps_of(run),
                 jumps=_jumps(reference) if name in angles else np.empty(0, int),
                 values=values,
                 reference=reference,
@@ -172,13 +174,15 @@ def _tracked_states(run: "Run") -> list[_Tracked]:
 def _draw_path(axis: Axes, times: np.ndarray, state: _Tracked) -> None:
     """Draws a state over time against its reference."""
     axis.plot(
-        *_broken(times, state.values, state.gaps),
+        broken(times, state.gaps),
+        broken(state.values, state.gaps),
         color=FLOWN,
         linewidth=1.6,
         label="flown",
     )
     axis.plot(
-        *_broken(times, state.reference, state.breaks),
+        broken(times, state.breaks),
+        broken(state.reference, state.breaks),
         color=REFERENCE,
         linewidth=1.2,
         linestyle=DASHED,
@@ -191,7 +195,12 @@ def _draw_error(axis: Axes, times: np.ndarray, state: _Tracked) -> None:
     """Draws how far a state is from its reference over time."""
     axis.axhline(0, color=REFERENCE, linewidth=1, linestyle=DASHED)
     error = state.values - state.reference
-    axis.plot(*_broken(times, error, state.breaks), color=FLOWN, linewidth=1.2)
+    axis.plot(
+        broken(times, state.breaks),
+        broken(error, state.breaks),
+        color=FLOWN,
+        linewidth=1.2,
+    )
 
 
 def _draw_prediction_error(
@@ -210,21 +219,9 @@ def _draw_prediction_error(
     axis.plot(times, state.values - state.expected, color=FLOWN, linewidth=1.0)
 
 
-def _gaps(run: "Run") -> np.ndarray:
-    """Returns the rows before which steps are lost."""
-    return np.flatnonzero(np.diff(run.steps) != 1) + 1
-
-
 def _jumps(reference: np.ndarray) -> np.ndarray:
     """Returns the rows at which the reference of an angle (K,) jumps by a turn."""
     return np.flatnonzero(np.abs(np.diff(reference)) > np.pi) + 1
-
-
-def _broken(
-    times: np.ndarray, values: np.ndarray, breaks: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a line that is broken before some rows."""
-    return np.insert(times, breaks, np.nan), np.insert(values, breaks, np.nan)
 
 
 def _noise_in_words(run: "Run") -> str:
@@ -360,10 +357,10 @@ def _until_steps_end(run: "Run", values: np.ndarray) -> tuple[np.ndarray, np.nda
     Where steps are lost, and behind the last one, a time is added at which they do; the
     value there is NaN before lost steps, and the last one again at the end.
     """
-    gaps = _gaps(run)
+    gaps = gaps_of(run)
     ends = _step_ends(run)
     times = np.insert(run.times, gaps, ends[gaps - 1])
-    held_values = np.insert(values, gaps, np.nan)
+    held_values = broken(values, gaps)
     return np.append(times, ends[-1]), np.append(held_values, values[-1])
 
 

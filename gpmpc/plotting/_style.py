@@ -7,7 +7,7 @@ their dashes as well as in their colours, so that a black and white print can be
 import io
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
@@ -18,6 +18,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import DataError, check_kind
+
+if TYPE_CHECKING:
+    from gpmpc.recording import Run
 
 BLUE = "#0072b2"
 VERMILION = "#d55e00"
@@ -125,6 +128,16 @@ def png(figure: Figure, dpi: int = 150) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()
+
+
+def gaps_of(run: "Run") -> np.ndarray:
+    """Returns the rows before which steps are lost."""
+    return np.flatnonzero(np.diff(run.steps) != 1) + 1
+
+
+def broken(values: np.ndarray, breaks: np.ndarray) -> np.ndarray:
+    """Returns the values (K, ...) of a line that is broken before some rows."""
+    return np.insert(values, breaks, np.nan, axis=0)
 
 
 def check_run(run: object) -> None:

@@ -88,8 +88,8 @@ class Flight:
         self._own_states = own_states
         self._on_step = on_step
         self._judge = judge
-        own = range(len(simulator.mean))[own_states]
-        self._angles = [i for i, j in enumerate(own) if j in simulator.angles]
+        own_indices = range(len(simulator.mean))[own_states]
+        self._angles = [i for i, j in enumerate(own_indices) if j in simulator.angles]
 
     def add(
         self,

@@ -60,11 +60,11 @@ class Scenario:
         check_method("controller", self.controller, "control", "GPMPC(...)")
         check_belongs(self.controller, self.signals, self.name)
         horizon = self.controller.horizon
-        given = read_reference(references).in_order(self.signals)
-        object.__setattr__(self, "stage_kappas", _stage_kappas(given, horizon))
+        reference = read_reference(references).in_order(self.signals)
+        object.__setattr__(self, "stage_kappas", _stage_kappas(reference, horizon))
         if self.stage_kappas is not None:
-            given = replace(given, kappas=None)
-        object.__setattr__(self, "path", _path_over(given, self.steps, horizon))
+            reference = replace(reference, kappas=None)
+        object.__setattr__(self, "path", _path_over(reference, self.steps, horizon))
 
     def reference_from(self, k: int) -> Reference:
         """Returns what the controller is to follow over its horizon from step k on."""

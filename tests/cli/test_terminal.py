@@ -15,6 +15,7 @@ import time
 
 import pytest
 
+from gpmpc.cli import _main
 from gpmpc.cli._commands import COMMANDS
 from gpmpc.cli._completion import candidates
 from gpmpc.cli._run import _was_interrupted
@@ -425,6 +426,28 @@ def test_a_signal_in_the_middle_of_flights_is_one_line(
     # Remarks on the flight may come before.
     assert shown.endswith(f"\n{words_at_the_end}\n")
     assert "Traceback" not in shown
+
+
+@pytest.mark.parametrize(
+    ("words", "goes_on"),
+    [
+        (["learn", "flight.csv", "mapping.yaml"], True),
+        (["run", "-m", "seed=1,2"], True),
+        (["run"], False),
+        (["plot", "tree"], False),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_an_interrupted_command_says_whether_it_goes_on(words, goes_on, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_main, "_call", interrupt)
+    monkeypatch.setattr(_main, "_run_with_settings", interrupt)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        _main._run(words, debug=False)
+    advice = "the same command goes on where it stopped"
+    assert str(caught.value) == (advice if goes_on else "")
 
 
 def test_an_error_while_handling_an_interrupt_is_the_interrupt():

@@ -7,7 +7,7 @@ import pytest
 
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import animate, inputs_figure, timing_figure, tracking_figure
-from gpmpc.plotting._animation import FFMpegWriter
+from gpmpc.plotting._animation import FFMpegWriter, draw_flight
 from gpmpc.recording import McapRecorder, RecordedSystem, read_run
 from tests.recording.runs import record_run
 
@@ -66,6 +66,11 @@ def test_nothing_is_drawn_across_lost_steps(with_gap):
     # An input holds until its own step ends: .1 s behind the last before the gap.
     assert line.get_xdata()[4] == pytest.approx(times[3] + 0.1)
     assert line.get_xdata()[-1] == pytest.approx(times[-1] + 0.1)
+    panels = draw_flight(with_gap)
+    panels.draw(5)
+    above, height = panels.figure.axes[:2]
+    for line in (above.lines[1], height.lines[1]):
+        assert np.flatnonzero(np.isnan(line.get_ydata())).tolist() == [4]
     stages = timing_figure(with_gap).axes[0].patches
     assert all(np.isnan(stage.get_data().values[4]) for stage in stages)
 

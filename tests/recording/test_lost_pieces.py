@@ -129,7 +129,7 @@ def test_a_chunk_of_short_steps_is_worth_its_index_entries(tmp_path):
             recorder.record(replace(step, k=k, time=10.0 * k))
     chunks = chunk_spans(path.read_bytes())
     numbers = 8 * (5 * 6 + 3 + 36 - 6 + 3 + 12 + 72)  # of a step [bytes]
-    assert len(chunks) == -(-40 * numbers // (_recorder._LEAST + numbers - 1))
+    assert len(chunks) == -(-40 * numbers // (_recorder._SMALLEST_CHUNK + numbers - 1))
 
 
 @pytest.mark.parametrize("end", ["finished", "killed"])

@@ -333,7 +333,7 @@ def test_a_file_with_names_alone_is_a_run_without_steps(tmp_path):
             assert (run.states.shape, run.plan_means.shape, run.residuals.shape) == (
                 (0, 2),
                 (0, 1, 2),
-                (0,),
+                (0, 3),
             )
         else:
             with pytest.raises(RecordingError, match=message):
