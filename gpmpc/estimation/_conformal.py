@@ -41,6 +41,7 @@ import torch
 from scipy.stats import beta
 
 from gpmpc._angles import angles_of, full_turns, state_difference
+from gpmpc._arrays import read_array
 from gpmpc._calls import explains_arguments
 from gpmpc._compiled import compiled
 from gpmpc._dynamics import Array, DynamicsModel, to_array
@@ -53,6 +54,7 @@ from gpmpc.exceptions import (
 )
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import Propagator, rollout
+from gpmpc.signals import signals_of
 
 
 @explains_arguments
@@ -106,11 +108,15 @@ class ConformalTube:
 
         Raises:
             ShapeError: States, inputs or rows do not belong together.
-            DataError: The log is shorter than the horizon, or a score is not finite.
+            DataError: The log is shorter than the horizon, a score is not finite, or a
+                table has other columns than the model's names.
         """
         check_number("horizon", horizon, least=1, whole=True)
-        x = torch.as_tensor(np.asarray(states), dtype=model.dtype, device=model.device)
-        u = torch.as_tensor(np.asarray(inputs), dtype=model.dtype, device=model.device)
+        names = signals_of(model)
+        states = read_array("states", states, names.state_names)
+        inputs = read_array("inputs", inputs, names.input_names)
+        x = torch.as_tensor(states, dtype=model.dtype, device=model.device)
+        u = torch.as_tensor(inputs, dtype=model.dtype, device=model.device)
         if x.dim() != 2 or u.dim() != 2 or len(u) not in (len(x) - 1, len(x)):
             got = f"{tuple(x.shape)} and {tuple(u.shape)}"
             raise ShapeError(

@@ -131,7 +131,7 @@ def estimate_process_noise(
     variance = (squares - latent).mean(0)
     # A variance of the latent function that is too large leaves something.
     floor = 0.01 * squares.mean(0)
-    successive = follows_previous(model, transitions)
+    successive = follows_previous(model, transitions).to(errors.device)
     correlation = torch.full_like(variance, torch.nan)
     if int(successive.sum()) >= _FEWEST_ROWS:
         first = errors[:-1][successive]
@@ -372,23 +372,25 @@ def estimate_varying_noise(
     See Also:
         ``gpmpc.models.NoisyModel``, which it makes.
     """
-    missed = residuals(model, transitions, block)
-    errors = missed.errors.cpu().double()
-    latent = missed.latent.cpu().double()
+    left_out = residuals(model, transitions, block)
+    errors = left_out.errors.cpu().double()
+    latent = left_out.latent.cpu().double()
     if len(errors) < 2 * FOLDS * block:
         raise DataError(
             f"a varying noise needs {2 * FOLDS} blocks of {block} rows or more; "
             f"got {len(errors)} rows"
         )
     squares = errors.square().clamp_min(1e-300)
-    learner = _VarianceLearner.start(transitions, squares, latent, seed)
+    states = transitions.states.cpu()
+    inputs = transitions.inputs.cpu()
+    learner = _VarianceLearner.start(states, inputs, squares, latent, seed)
     fold = torch.arange(len(squares)) // block % FOLDS
     gains = torch.zeros_like(errors)
     for part in range(FOLDS):
         held_out = fold == part
         gains[held_out] = learner.learn(~held_out).gain_over_constant(
-            transitions.states[held_out],
-            transitions.inputs[held_out],
+            states[held_out],
+            inputs[held_out],
             squares[held_out],
             latent[held_out],
         )
@@ -454,11 +456,24 @@ class _VarianceLearner(NamedTuple):
 
     @classmethod
     def start(
-        cls, transitions: Transitions, squares: Tensor, latent: Tensor, seed: int
+        cls,
+        states: Tensor,
+        inputs: Tensor,
+        squares: Tensor,
+        latent: Tensor,
+        seed: int,
     ) -> "_VarianceLearner":
-        """Finds hyperparameters by GP regression on log e^2."""
-        features = transitions.features
-        m = transitions.input_dim
+        """Finds hyperparameters by GP regression on log e^2.
+
+        Args:
+            states: (N, n).
+            inputs: (N, m).
+            squares: Squared residuals (N, k).
+            latent: Variances of the latent functions (N, k).
+            seed: Of the rows that are searched.
+        """
+        features = torch.cat([states, inputs], dim=1)
+        m = inputs.shape[1]
         constant = _constant_log_variance(squares, latent)
         total = constant.exp() + latent
         responses = (squares * constant.exp() / total).log() - CHI2_LOG_MEAN

@@ -121,8 +121,9 @@ class ChangedModel(Wrapper):
 
     @cached_property
     def gp_noise(self) -> Array:
-        """Noise variances of the model's GP (k,)."""
-        return to_array(self.gp.noise_variance)
+        """Noise variances of the targets of the model's GP (k,), sensors' included."""
+        noise = self.gp.observation_noise
+        return to_array(self.gp.noise_variance if noise is None else noise)
 
     @cached_property
     def signal(self) -> Array:

@@ -49,7 +49,7 @@ class OutputGP:
         points = np.ascontiguousarray(features.reshape(-1, features.shape[-1]))
         no_inputs = np.empty((len(points), 0))
         mean = self.posterior.linearize(points, no_inputs, covariance=False).mean
-        return mean.reshape(*features.shape[:-1], -1)
+        return mean.reshape(*features.shape[:-1], mean.shape[1])
 
 
 class StateParts(NamedTuple):

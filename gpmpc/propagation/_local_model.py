@@ -131,7 +131,8 @@ def expand_belief(
 
 def _extended_state(mean: Tensor, root: Array) -> Array:
     """Returns s = [mu; vec(S)] (*batch, p)."""
-    vectors = root.reshape(*mean.shape[:-1], -1)
+    n = mean.shape[-1]
+    vectors = root.reshape(*mean.shape[:-1], n * n)
     return np.concatenate([to_array(mean), vectors], axis=-1)
 
 
@@ -164,7 +165,7 @@ def _extended_derivatives(
     inverse = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0)
     rotated = _congruence(next_U.mT, covariance_by)
     root_by = _congruence(next_U, rotated * inverse[..., None])
-    root_by = root_by.reshape(*batch, n * n, -1)
+    root_by = root_by.reshape(*batch, n * n, covariance_by.shape[-1])
     mean_by_mean = to_array(sensitivity.mean_by_mean)
     mean_by_root = mean_by_root.reshape(*batch, n, n * n)
     mean_by_state = np.concatenate([mean_by_mean, mean_by_root], axis=-1)
@@ -176,7 +177,8 @@ def _extended_derivatives(
 
 def _congruence(U: Array, X: Array) -> Array:
     """Returns U X U' for each X along the last dimension (*batch, n, n, j)."""
-    return U[..., None, :, :] @ (U @ X.reshape(*X.shape[:-2], -1)).reshape(X.shape)
+    *batch, n, j = X.shape
+    return U[..., None, :, :] @ (U @ X.reshape(*batch, n * j)).reshape(X.shape)
 
 
 @explains_arguments

@@ -2,6 +2,7 @@
 so against any plant."""
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from scipy.stats import beta, norm
@@ -10,6 +11,7 @@ from gpmpc.estimation import AdaptiveTube, ConformalTube
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation import Linearization
+from gpmpc.signals import Signals
 
 H = 5
 F = torch.float64
@@ -229,6 +231,17 @@ def test_misuse_is_refused():
             mistake()
     with pytest.raises(SettingError, match="angles: must be a list of different"):
         ConformalTube(np.ones((5, 1)), [[1.0, 0.0]], angles=[2])
+
+
+def test_columns_of_a_table_are_sorted_by_the_names_of_the_model():
+    x, u = log(60, 0)
+    named = Walk(1.0)
+    named.signals = Signals(["a", "b"], ["c", "d"])
+    states = pd.DataFrame(x, columns=["a", "b"])[["b", "a"]]
+    inputs = pd.DataFrame(u, columns=["c", "d"])[["d", "c"]]
+    expected = ConformalTube.calibrate(MODEL, PROPAGATOR, x, u, H)
+    tube = ConformalTube.calibrate(named, PROPAGATOR, states, inputs, H)
+    assert np.array_equal(tube.scores, expected.scores)
 
 
 def test_what_was_handed_out_or_taken_belongs_to_each_side():

@@ -136,6 +136,16 @@ def test_an_autonomous_model_needs_no_input(name):
     assert rollout(propagator, model, belief(), torch.zeros(3, 0)).mean.shape == (3, 2)
 
 
+@pytest.mark.parametrize("name", ALL)
+def test_no_belief_at_all_has_local_models_of_the_right_shape(name):
+    for batch in ((0,), (2, 0)):
+        at = Gaussian(torch.zeros(*batch, 2), torch.zeros(*batch, 2, 2))
+        local = linearize(ALL[name](), gp(), at, torch.zeros(*batch, 1))
+        assert local.A.shape == (*batch, 6, 6)
+        assert local.B.shape == (*batch, 6, 1)
+        assert local.c.shape == (*batch, 6)
+
+
 def test_inputs_without_a_horizon_are_refused():
     for inputs in (torch.zeros(1), torch.zeros(0, 1)):
         with pytest.raises(
