@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from gpmpc._arrays import read_array
 from gpmpc._dynamics import DynamicsModel, to_array
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.export._c_types import fields_type, reference_type
+from gpmpc.export._checks import check_kappas
 from gpmpc.export._filter import Estimator
 from gpmpc.export._functions import FunctionWriter, parameter_rows
 from gpmpc.export._text import Numbers
@@ -116,15 +118,24 @@ class CompiledLibrary:
         self._code.gpmpc_reset(ctypes.byref(controller.fields))
 
     def reference(self, reference: Reference, parameters: Any = None) -> Any:
-        """Returns a reference, and parameters, as the code takes them."""
+        """Returns a reference, and parameters, as the code takes them.
+
+        Raises:
+            ShapeError: One of another size than the controller's.
+            SettingError: Kappas, which exported code takes from the problem.
+        """
         followed = reference.over(self._horizon)
-        _check_size("a reference", followed.states, self._states)
+        check_kappas(followed)
+        rows = self._horizon + 1
+        _check_shape("a reference", followed.states, (rows, self._states))
         converted = self._reference_type()
         if self._parameters:
             rows = parameter_rows(parameters, self._horizon, self._parameters)
             view(converted.parameters)[:] = rows
         view(converted.states)[:] = followed.states
         if followed.inputs is not None:
+            inputs = followed.inputs
+            _check_shape("reference inputs", inputs, (self._horizon, self._inputs))
             view(converted.inputs)[:] = followed.inputs
             converted.has_inputs = 1
         return converted
@@ -146,11 +157,11 @@ class CompiledLibrary:
         if isinstance(measured, Gaussian):
             step = self._code.gpmpc_step_belief
             numbers = [to_array(measured.mean), to_array(measured.covariance)]
-            _check_size("a belief", numbers[0], self._states)
+            _check_shape("a belief", numbers[0], (self._states,))
         else:
             step = self._code.gpmpc_step
             numbers = [measured]
-            _check_size("a measurement", measured, self._measured)
+            _check_shape("a measurement", measured, (self._measured,))
         arrays = [np.ascontiguousarray(part, dtype=self.dtype) for part in numbers]
         step(
             ctypes.byref(controller.fields),
@@ -161,11 +172,11 @@ class CompiledLibrary:
         return input.astype(float)
 
 
-def _check_size(name: str, numbers: Any, size: int) -> None:
-    """Raises ``ShapeError`` unless rows have as many numbers as the code reads."""
+def _check_shape(name: str, numbers: Any, shape: tuple[int, ...]) -> None:
+    """Raises ``ShapeError`` unless there are as many numbers as the code reads."""
     got = np.shape(numbers)
-    if got[-1:] != (size,):
-        raise ShapeError(f"{name} must have {size} numbers; got the shape {got}")
+    if got != shape:
+        raise ShapeError(f"{name} must have the shape {shape}; got {got}")
 
 
 def _address(array: Array) -> ctypes.c_void_p:
@@ -210,6 +221,8 @@ class CompiledController:
         parameters: Any = None,
     ) -> Decision:
         """Decides the input for one step; see ``GPMPC.control``."""
+        belief = belief.in_order(self.signals.state_names)
+        reference = reference.in_order(self.signals)
         fields = self._struct.fields
         self._library.reset(self._struct)
         if previous is not None:
@@ -281,6 +294,7 @@ class CompiledLoop:
             controller, precision, on_failure, compiler, estimator
         )
         self._filters = estimator is not None
+        self._signals = controller.signals
         self._struct = self._library.new_controller()
         self.memory_bytes = self._struct.size
         self.status = Status.SOLVED
@@ -309,9 +323,15 @@ class CompiledLoop:
             reference: A set point (n,), states (H + 1, n), or a ``Reference``.
             parameters: Of outputs and smooth constraints.
         """
-        followed = self._library.reference(read_reference(reference), parameters)
+        names = () if self._filters else self._signals.state_names
+        if isinstance(measured, Gaussian):
+            measured = measured.in_order(self._signals.state_names)
+        else:
+            measured = read_array("measured", measured, names)
+        followed = read_reference(reference).in_order(self._signals)
+        converted = self._library.reference(followed, parameters)
         began = perf_counter()
-        input = self._library.step(self._struct, measured, followed)
+        input = self._library.step(self._struct, measured, converted)
         self.seconds = perf_counter() - began
         fields = self._struct.fields
         self.status = _STATUSES[fields.status]

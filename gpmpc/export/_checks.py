@@ -5,8 +5,15 @@ from typing import Any
 from gpmpc._dynamics import check_next_states
 from gpmpc.exceptions import SettingError, check_choice
 from gpmpc.models import DelayedModel
-from gpmpc.mpc import GPMPC
+from gpmpc.mpc import GPMPC, Reference
 from gpmpc.qp import DualActiveSet
+
+
+def check_kappas(reference: Reference) -> None:
+    """Raises ``SettingError`` for a reference with deviations of its own."""
+    if reference.kappas is not None:
+        rule = "an exported controller keeps its problem's deviations; leave them out"
+        raise SettingError("reference.kappas", f"{rule}; got {reference.kappas}")
 
 
 def check_exportable(controller: Any, on_failure: str) -> None:

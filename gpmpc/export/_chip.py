@@ -24,6 +24,7 @@ import numpy as np
 
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, check_choice
+from gpmpc.export._checks import check_kappas
 from gpmpc.export._filter import Estimator
 from gpmpc.export._functions import FunctionWriter, parameter_rows
 from gpmpc.export._replay import Question
@@ -308,6 +309,7 @@ def _flight_header(
     references = []
     for question in questions:
         followed = question.reference.over(H)
+        check_kappas(followed)
         inputs = np.zeros((H, m)) if followed.inputs is None else followed.inputs
         rows = parameter_rows(question.parameters, H, count) if count else [[0.0]]
         parts = [

@@ -74,6 +74,7 @@ class FilterWriter:
                 "#define filter_model_covariance model_covariance\n",
             ]
         else:
+            model.variances = True
             model.write(kalman.model, "filter_model")
         measurement = kalman.measurement
         belief = estimator.belief.in_order(signals_of(kalman.model).state_names)

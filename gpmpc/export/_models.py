@@ -33,12 +33,13 @@ class ModelWriter:
     """Writes the functions and tables of one model.
 
     Attributes:
+        variances: Whether functions of variances are written, too.
         sizes: Of what its functions work in: N, d N, k N and k, at most.
     """
 
     def __init__(self, numbers: Numbers, variances: bool, means_alone: bool):
         self._numbers = numbers
-        self._variances = variances
+        self.variances = variances
         self._means_alone = means_alone
         self._parts: list[str] = []
         self._gps = 0
@@ -131,7 +132,7 @@ class ModelWriter:
             table(f"{prefix}_offset", to_array(gp.offset), "prior means (k,)"),
         ]
         cholesky = "0"
-        if self._variances:
+        if self.variances:
             cholesky = f"{prefix}_cholesky"
             rows, columns = np.tril_indices(size)
             factors = to_array(gp.cholesky)[:, rows, columns]
@@ -155,7 +156,7 @@ class ModelWriter:
         needed = {
             "POINTS": points,
             "DIFFERENCES": features * points,
-            "KERNELS": outputs * points if self._variances else 0,
+            "KERNELS": outputs * points if self.variances else 0,
             "GP_OUTPUTS": outputs,
         }
         for name, size in needed.items():
@@ -326,14 +327,14 @@ class ModelWriter:
         elif isinstance(model, DisturbedModel):
             what += ": disturbances are states"
         self._function(_SIGNATURE.format(name=name), body, what)
-        if self._variances:
+        if self.variances:
             line = f"#define {name}_variances {inner}_variances\n"
             self._parts.append(line)
         self._write_covariance(name, _padded_variance_lines(n, p, inner))
 
     def _write_variances(self, name: str, table: str) -> None:
         """Writes the function of the GPs' variances at the points that were kept."""
-        if not self._variances:
+        if not self.variances:
             return
         body = ["(void)work;", "(void)variance;"]
         if table:
@@ -343,7 +344,7 @@ class ModelWriter:
 
     def _write_covariance(self, name: str, body: Sequence[str]) -> None:
         """Writes the function from the GPs' variances at a point to V (n, n)."""
-        if not self._variances:
+        if not self.variances:
             return
         signature = f"static void {name}_covariance(const real *variance, real *V)"
         self._function(signature, body, "V: covariance of the next state")

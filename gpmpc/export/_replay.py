@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpmpc._files import write_whole
+from gpmpc.export._checks import check_kappas
 from gpmpc.export._filter import Estimator, check_estimator
 from gpmpc.export._functions import FunctionWriter, parameter_rows
 from gpmpc.export._text import Numbers
@@ -94,6 +95,7 @@ def write_replay(
 
     Raises:
         ShapeError: Parameters of another number than the controller takes.
+        SettingError: A reference with kappas, which exported code does not take.
     """
     count = FunctionWriter(controller, Numbers("double")).parameters
     lines = []
@@ -109,9 +111,18 @@ def _numbers_of(answer: Answer, horizon: int, parameters: int) -> list[np.ndarra
     """Returns the numbers of a line, in the order in which C reads them."""
     question = answer.question
     followed = question.reference.over(horizon)
+    check_kappas(followed)
     inputs = followed.inputs
+    has_inputs = inputs is not None
     if inputs is None:
         inputs = np.zeros((horizon, len(answer.input)))
     rows = parameter_rows(question.parameters, horizon, parameters)
-    parts = (question.measured, followed.states, inputs, rows, answer.input)
+    parts = (
+        question.measured,
+        followed.states,
+        has_inputs,
+        inputs,
+        rows,
+        answer.input,
+    )
     return [np.ravel(np.asarray(part, dtype=float)) for part in parts]

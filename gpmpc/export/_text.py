@@ -19,6 +19,11 @@ class Numbers:
 
     def number(self, value: float) -> str:
         """Returns a number that C reads back to the same bits."""
+        if self.precision == "float":
+            with np.errstate(over="ignore"):
+                value = float(np.float32(value))
+        if np.isnan(value):
+            return "NAN"
         if np.isinf(value):
             return "INFINITY" if value > 0 else "-INFINITY"
         if self.precision == "float":

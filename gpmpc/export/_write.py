@@ -149,7 +149,8 @@ def _texts(
     functions = FunctionWriter(controller, numbers)
     prediction = controller.prediction
     means_alone = needs_means_alone(controller)
-    variances = tightens(controller) or estimator is not None
+    shares_model = estimator is not None and estimator.filter.model is prediction.model
+    variances = tightens(controller) or shares_model
     model = ModelWriter(numbers, variances, means_alone)
     model.write(prediction.model, "model")
     filter_tables = ""

@@ -1108,7 +1108,6 @@ static void condense(gpmpc_controller *controller)
    The decision.
    --------------------------------------------------------------------------------- */
 
-/* What a plan costs: its stages, summed. */
 #if GPMPC_ROLLS_OUT || GPMPC_ELASTIC
 /* Replaces a plan (x', u') by the one that the dynamics obey on the way along it,
    u = u' + F (x - x') within its bounds. */
@@ -1141,6 +1140,7 @@ static void follow(gpmpc_controller *controller, real *states, real *inputs)
 #endif
 
 #if GPMPC_ELASTIC
+/* What a plan costs: its stages, summed. */
 static real cost_of_plan(const gpmpc_problem *problem, const real *states,
                          const real *inputs)
 {

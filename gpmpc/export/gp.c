@@ -204,8 +204,8 @@ static void whiten(const wide *L, wide *v, int points, wide square[GPMPC_LANES])
     }
 }
 
-/* Writes the variances (lanes, k) of the points whose kernels were kept, which are
-   lost: variance_a = sf2_a - |L_a^-1 k_a|^2 */
+/* Writes the variances of the points whose kernels were kept, which are lost, lane by
+   lane, GPMPC_GP_OUTPUTS places each: variance_a = sf2_a - |L_a^-1 k_a|^2 */
 static void gp_variances(const gp_tables *gp, gpmpc_work *work, real *variance)
 {
     int count = gp->points;
@@ -216,7 +216,7 @@ static void gp_variances(const gp_tables *gp, gpmpc_work *work, real *variance)
                     work->kernels + a * count * GPMPC_LANES, count, square);
         for (lane = 0; lane < GPMPC_LANES; lane++) {
             wide value = gp->signal[a] - square[lane];
-            variance[lane * gp->outputs + a] = value > 0 ? (real)value : 0;
+            variance[lane * GPMPC_GP_OUTPUTS + a] = value > 0 ? (real)value : 0;
         }
     }
 }

@@ -1,3 +1,8 @@
+#include <float.h>
+#if DBL_MANT_DIG != 53
+#error "sums of the GPs need a double of 64 bits"
+#endif
+
 /* Numbers that depend on the digits. Each is a power of the rounding unit: in float the
    same power of a larger one. */
 #if GPMPC_IS_FLOAT

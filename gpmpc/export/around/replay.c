@@ -4,8 +4,8 @@
      ./replay replay.txt
 
    Every line of the file is a step: what was measured (p), the reference r_0 .. r_H
-   ((H + 1) n), its inputs (H m), the parameters (H q), the input that Python decided on
-   (m), and the status.
+   ((H + 1) n), whether it has inputs (0 or 1), its inputs (H m), the parameters (H q),
+   the input that Python decided on (m), and the status.
    Prints the largest deviation, and how many statuses differ. */
 
 #include <math.h>
@@ -43,11 +43,12 @@ int main(int count, char **arguments)
         return 2;
     }
     gpmpc_reset(&controller);
-    reference.has_inputs = 1;
     while (read_numbers(file, measured, GPMPC_MEASURED)) {
         int status, i;
+        gpmpc_real has_inputs;
         if (!read_numbers(file, &reference.states[0][0],
                           (GPMPC_HORIZON + 1) * GPMPC_STATES)
+            || !read_numbers(file, &has_inputs, 1)
             || !read_numbers(file, &reference.inputs[0][0],
                              GPMPC_HORIZON * GPMPC_INPUTS)
             || !read_numbers(file, &reference.parameters[0][0],
@@ -58,9 +59,13 @@ int main(int count, char **arguments)
             (void)fclose(file);
             return 2;
         }
+        reference.has_inputs = has_inputs != 0;
         status = gpmpc_step(&controller, measured, &reference, input);
-        for (i = 0; i < GPMPC_INPUTS; i++)
-            worst = fmax(worst, fabs((double)input[i] - (double)expected[i]));
+        for (i = 0; i < GPMPC_INPUTS; i++) {
+            double miss = fabs((double)input[i] - (double)expected[i]);
+            if (!(miss <= worst))
+                worst = miss == miss ? miss : HUGE_VAL; /* not a number */
+        }
         other_statuses += status != expected_status;
         steps++;
     }
