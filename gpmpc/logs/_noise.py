@@ -25,7 +25,7 @@ from gpmpc.models._log_model import LogModel
 from gpmpc.models._windows import Windows
 
 _STEPS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # whose errors are explained
-_WINDOWS = 2000  # of a fold, whose errors count
+_WINDOWS = 2000  # of all folds, whose errors count
 _COMPARED = 250  # of a log, on which models of more and of fewer rows are compared
 _LINEARIZED = 400  # of all folds, along which rollouts are linearised: these are slow
 _LINEARIZED_WITH_MEMORY = 120  # likewise of models with many entries to carry on
@@ -126,7 +126,13 @@ def fit_noise(
     steps = [step for step in _STEPS if step <= longest]
     linearized = _LINEARIZED if models[0].memory.empty else _LINEARIZED_WITH_MEMORY
     folds = [
-        _fold_errors(model, log, steps, linearized // len(models))
+        _fold_errors(
+            model=model,
+            log=log,
+            steps=steps,
+            most=_WINDOWS // len(models),
+            linearized=linearized // len(models),
+        )
         for model, log in zip(models, logs, strict=True)
     ]
     squared = np.concatenate([fold.squared for fold in folds]).mean(axis=0)
@@ -234,7 +240,7 @@ def _group_ratios(kinematics: Kinematics, squared: Array, claimed: Array) -> Arr
 
 
 def _fold_errors(
-    model: LogModel, log: Log, steps: Sequence[int], linearized: int
+    model: LogModel, log: Log, steps: Sequence[int], most: int, linearized: int
 ) -> _FoldErrors:
     """Computes the errors of a fold, and its responses to the sources of noise.
 
@@ -242,9 +248,10 @@ def _fold_errors(
         model: That was not fitted to the log.
         log: Held-out runs.
         steps: After the starts.
+        most: Number of windows, about.
         linearized: Number of windows along which rollouts are linearised, about.
     """
-    windows = log.windows(max(steps), past=max(model.past, PAST), most=_WINDOWS)
+    windows = log.windows(max(steps), past=max(model.past, PAST), most=most)
     stride = -(-len(windows) // linearized)
     measured, modelled = model.first_outputs(windows)
     return _FoldErrors(

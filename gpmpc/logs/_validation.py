@@ -67,6 +67,7 @@ class Validations:
         self._steps = steps
         self._judged_steps = judged_steps
         self._validations: dict[str, list[_Validation]] = {}
+        self._models: dict[str, list[LogModel]] = {}  # of the folds, corrected
 
     def choose_averages(self, structure: Structure) -> Averages | None:
         """Chooses the best average of corrections of a structure.
@@ -87,15 +88,17 @@ class Validations:
         models = self._fits.models(structure)
         if not structure.shares:
             return models
-        rollouts = [
-            self._rollouts(model, fold.held_out)
-            for model, fold in zip(models, self._folds, strict=True)
-        ]
-        # What one fold holds out, the models of the others were fitted to.
-        return [
-            self._correct(model, structure, rollouts[:i] + rollouts[i + 1 :])
-            for i, model in enumerate(models)
-        ]
+        if structure.key not in self._models:
+            rollouts = [
+                self._rollouts(model, fold.held_out)
+                for model, fold in zip(models, self._folds, strict=True)
+            ]
+            # What one fold holds out, the models of the others were fitted to.
+            self._models[structure.key] = [
+                self._correct(model, structure, rollouts[:i] + rollouts[i + 1 :])
+                for i, model in enumerate(models)
+            ]
+        return self._models[structure.key]
 
     def fit_noise(self, structure: Structure) -> OutputNoise:
         """Fits the noise of a structure to the errors of its rollouts."""
