@@ -93,7 +93,7 @@ def _fly_job(job: Job) -> None:
     from gpmpc._compiling import report_compilation
     from gpmpc.cli._run import RunSettings, run_one
 
-    settings = RunSettings(
+    to_fly = RunSettings(
         config=job.settings.config(),
         options=job.settings.options,
         choices=job.choices,
@@ -101,7 +101,7 @@ def _fly_job(job: Job) -> None:
         folder=job.folder,
     )
     with report_compilation():
-        run_one(settings, wait=False)
+        run_one(to_fly, wait=False)
 
 
 class Chunking:

@@ -42,7 +42,8 @@ class Report:
     ``runs`` has a row for every run that is there or was asked for, cell by cell and
     seed by seed. Its columns are
 
-    - ``cell``, the position in ``cells``, and ``seed``, a text;
+    - ``cell``, the position in ``cells``, and ``seed``, a text; ``names_seed``, whether
+      the run chose it;
     - ``state``: "finished", "failed", "missing" (there is nothing of it) or "skipped"
       (it cannot be read);
     - the measures, NaN where the run has none;
@@ -113,7 +114,6 @@ class Report:
         """
         to_fly = self.runs[self.runs.state.isin(("missing", "failed"))]
         commands = []
-        to_fly = to_fly.assign(names_seed=to_fly.seed != _DEFAULT)
         groups = to_fly.groupby(["cell", "search_options", "names_seed"])
         for (cell, options, names_seed), runs in groups:
             varied = dict(zip(self.variables, self.cells[cell], strict=True))
@@ -312,6 +312,7 @@ def _table_of(
         row = by_place[place].row()
         row["cell"] = position[place.cell]
         row["seed"] = place.seed
+        row["names_seed"] = SEED in by_place[place].choices
         for name, value in row.items():
             columns.setdefault(name, []).append(value)
     types = dict.fromkeys(MEASURES, float) | {"cell": int}

@@ -96,6 +96,16 @@ def test_gaps_of_runs_without_a_seed_are_filled_without_one(tmp_path):
         assert report.base_settings() == []
 
 
+def test_a_failed_run_that_chose_no_seed_flies_again_in_its_folder(tmp_path):
+    choices = ["controller=lqr"]
+    settings = SETTINGS | {"seed": 0, "options": {"controller": "lqr"}}
+    made_up_run(tmp_path, choices, settings, error="killed")
+    add(tmp_path, "convex", 0, 0.1)
+    report = read_report(tmp_path)
+    assert seeds(cells(report)[1], "failed") == ["0"]
+    assert report.commands() == [f"gpmpc run -m controller=lqr folder={tmp_path}"]
+
+
 def test_a_lost_run_leaves_the_settings_of_all_others_told(tree):
     shared = read_report(tree).base_settings()
     assert "horizon: 10" in shared
