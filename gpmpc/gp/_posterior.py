@@ -255,7 +255,7 @@ class GPPosterior(TensorModel):
         ``noise_variance`` is the process' part alone. Pseudo-observations, as of a
         sparse model, have a noise of their own each, correlated with that of others.
         """
-        diagonal = self.cholesky.square().sum(-1)
+        diagonal = torch.linalg.vector_norm(self.cholesky, dim=-1).square()
         nominal = (self.signal_variance + self.noise_variance)[:, None]
         if self._is_round_off(diagonal - nominal):
             return self.noise_variance
