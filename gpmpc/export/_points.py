@@ -15,7 +15,7 @@ from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gp import GPPosterior, Hyperparameters, informative_points
 from gpmpc.gp._kernel import kernel_matrix
-from gpmpc.gp._sparse import sparse_posterior
+from gpmpc.gp._sparse import JITTER, sparse_posterior
 from gpmpc.models import ResidualModel
 from gpmpc.models._wrapper import LinearWrapper
 
@@ -97,6 +97,9 @@ def _sparse(gp: GPPosterior, count: int) -> GPPosterior:
         hyperparameters,
         input_dim=gp.input_dim,
         predicts=gp.predicts,
+        # always: it moves means by hundredths of the noise, and makes the weights, whose
+        # terms cancel in a sum, several times smaller
+        jitter=JITTER,
     )
     return replace(
         sparse,
