@@ -97,8 +97,8 @@ def _sparse(gp: GPPosterior, count: int) -> GPPosterior:
         hyperparameters,
         input_dim=gp.input_dim,
         predicts=gp.predicts,
-        # always: it moves means by hundredths of the noise, and makes the weights, whose
-        # terms cancel in a sum, several times smaller
+        # always: it moves means by hundredths of the noise, and makes the weights,
+        # whose terms cancel in a sum, several times smaller
         jitter=JITTER,
     )
     return replace(
