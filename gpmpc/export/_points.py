@@ -10,6 +10,8 @@ points count as targets then, so that variances come out larger, never the means
 from dataclasses import replace
 from typing import Any, TypeVar
 
+import torch
+
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError, check_number
@@ -90,17 +92,18 @@ def _sparse(gp: GPPosterior, count: int) -> GPPosterior:
     targets = gp.targets - gp.offset
     if not gp.has_observation_noise:
         targets = _means_at_points(gp)
-    sparse = sparse_posterior(
-        gp.features[chosen],
-        gp.features,
-        targets,
-        hyperparameters,
-        input_dim=gp.input_dim,
-        predicts=gp.predicts,
-        # always: it moves means by hundredths of the noise, and makes the weights,
-        # whose terms cancel in a sum, several times smaller
-        jitter=JITTER,
-    )
+    with torch.no_grad():
+        sparse = sparse_posterior(
+            gp.features[chosen],
+            gp.features,
+            targets,
+            hyperparameters,
+            input_dim=gp.input_dim,
+            predicts=gp.predicts,
+            # always: it moves means by hundredths of the noise, and makes the weights,
+            # whose terms cancel in a sum, several times smaller
+            jitter=JITTER,
+        )
     return replace(
         sparse,
         targets=sparse.targets + gp.offset,
