@@ -32,9 +32,9 @@ from gpmpc.export._write import reduce_points
 from gpmpc.mpc import GPMPC
 
 # of neighbouring counts in the table
-_RATIO = 2**-0.5
+_RATIO = 0.6
 # steps of the flight in which instructions are counted
-_REPLAYED = 50
+_REPLAYED = 20
 _EXAMPLE = "flash=64kB,ram=32kB,instructions=2M"
 _AMOUNT = re.compile(r"(?P<number>[0-9]*\.?[0-9]+)\s*(?P<unit>[a-z]*)")
 _BYTES = {"": 1, "b": 1, "k": 1024, "m": 1024**2}
@@ -231,7 +231,9 @@ class _Search:
         self._on_failure = on_failure
         self._estimator = estimator
         self._progress = progress
-        self._footprints: dict[int, Footprint] = {}
+        self._footprints: dict[tuple[int, bool], Footprint] = {}
+        # between the rows of the table, only what the budget limits is measured
+        self._searches_instructions = budget.instructions is not None
         self._size = len(posterior_of(self._model))
         self._informative = len(informative_order(self._model))
         if budget.instructions is not None:
@@ -277,31 +279,37 @@ class _Search:
         too_many = counts[counts.index(fits) - 1]
         while too_many - fits > 1:
             middle = (too_many + fits) // 2
-            if self._fits(middle):
+            if self._fits(middle, replays=self._searches_instructions):
                 fits = middle
             else:
                 too_many = middle
         return fits
 
-    def _fits(self, count: int) -> bool:
+    def _fits(self, count: int, replays: bool = True) -> bool:
         """Returns whether the code of so many points is within the budget."""
-        return not self._budget.excesses(self._footprint(count))
+        return not self._budget.excesses(self._footprint(count, replays))
 
-    def _footprint(self, count: int) -> Footprint:
-        """Returns what the code of so many points takes."""
-        if count not in self._footprints:
+    def _footprint(self, count: int, replays: bool = True) -> Footprint:
+        """Returns what the code of so many points takes.
+
+        Args:
+            count: Of points.
+            replays: Whether instructions are counted, where they can be.
+        """
+        key = (count, replays)
+        if key not in self._footprints:
             self._progress(f"compiling {count} points")
             controller, estimator = self._reduced(count)
-            questions = [] if estimator else self._flight.questions[:_REPLAYED]
-            self._footprints[count] = measure_footprint(
+            questions = self._flight.questions[:_REPLAYED]
+            self._footprints[key] = measure_footprint(
                 controller,
-                questions,
+                questions if replays and estimator is None else (),
                 chip=self._chip,
                 precision=self._precision,
                 on_failure=self._on_failure,
                 estimator=estimator,
             )
-        return self._footprints[count]
+        return self._footprints[key]
 
     def _reduced(self, count: int) -> tuple[GPMPC, Estimator | None]:
         """Returns controller and filter of so many points."""

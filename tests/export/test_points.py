@@ -193,7 +193,7 @@ def compiled(monkeypatch):
     def footprint(controller, questions, **_):
         points = len(controller.prediction.model)
         counts.append(points)
-        assert len(questions) == 10
+        assert len(questions) in (0, 10)
         return Footprint(
             flash=1000 + 100 * points, ram=500, stack=points, compiler="formula"
         )
@@ -218,7 +218,7 @@ def test_the_most_points_that_fit_are_chosen(budget, points, compiled):
     assert choice.points == points
     assert choice.rows[0].points == 40
     assert choice.rows[-1].points == 4  # a plane over three features
-    assert len(compiled) == len(set(compiled)) < 14
+    assert len(compiled) <= len(set(compiled)) + 1 < 14  # the chosen one twice
     assert choice.rows[0].cost == choice.rows[0].error == 1.0
     assert abs(choice.rows[1].cost - 1.0) < 1e-3
     assert choice.rows[-1].error > choice.rows[1].error
