@@ -21,7 +21,7 @@ from gpmpc.exceptions import GpmpcError
 
 ROOT = Path(__file__).resolve().parents[1]
 #: files that no number depends on: how documents look, texts of the command line
-SHOWN_ONLY = {".css", ".mplstyle", ".txt", ".typed", ".cpp", ".properties", ""}
+SHOWN_ONLY = {".css", ".ld", ".mplstyle", ".txt", ".typed", ".cpp", ".properties", ""}
 
 
 @pytest.fixture
