@@ -3,8 +3,9 @@
     .venv/bin/python -m benchmarks.export [--questions 20000] [--cases quadrotor-10 ..]
                                           [--precisions double float] [--check]
 
-Seven controllers fly in closed loops of Python: the quadrotor of the paper with a
-horizon of 10 and of 20 (chance constraints of its position), a learned cart-pole that
+Eight controllers fly in closed loops of Python: the quadrotor of the paper with a
+horizon of 10 and of 20 (chance constraints of its position), and with so few points
+that float takes its sums in whole numbers, a learned cart-pole that
 must keep to its rail, the MuJoCo quadrotor whose residual is learned on a rigid body,
 the learned pole whose input acts three steps late, four levels of a quadruple tank, and
 a stirred tank whose reaction may run away. Every question of these flights (belief,
@@ -34,7 +35,7 @@ import torch
 from benchmarks import delayed_pole, quadrotor
 from benchmarks.export_checks import CheckedController
 from benchmarks.timing import use_one_thread, write_results
-from gpmpc.export import CompiledController
+from gpmpc.export import CompiledController, with_points
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions, standardize
 from gpmpc.gp.casadi_ import successor_function
@@ -149,9 +150,16 @@ class CompiledAnswers:
         }
 
 
-def paper_quadrotor(horizon: int) -> Case:
-    """The quadrotor's outer loop, its position kept with 95 %."""
+def paper_quadrotor(horizon: int, points: int | None = None) -> Case:
+    """The quadrotor's outer loop, its position kept with 95 %.
+
+    Args:
+        horizon: H.
+        points: How many of its points stay; all by default.
+    """
     model = quadrotor.trained("lorenz")
+    if points is not None:
+        model = with_points(model, points)
     lower, upper = quadrotor.STATE_BOUNDS["lorenz"]
     box = Box(lower, upper, probability=0.95)
     controller = GPMPC(
@@ -412,6 +420,7 @@ def mujoco_quadrotor() -> Case:
 CASES: dict[str, Callable[[], Case]] = {
     "quadrotor-10": lambda: paper_quadrotor(10),
     "quadrotor-20": lambda: paper_quadrotor(20),
+    "quadrotor-46-points": lambda: paper_quadrotor(10, points=46),
     "cart-pole": learned_cart_pole,
     "mujoco-quadrotor": mujoco_quadrotor,
     "delayed-pole": late_pole,

@@ -15,7 +15,7 @@ _MOST_BITS = 60
 # Rounding of a mean and of a slope, as shares of the means' range over the points, and
 # of that over the range of a feature. Beyond, an input may miss 1e-4 of its range: it
 # did by 9e-4, under a light weight, with means of 2e-5 and slopes of 7e-4.
-_MEAN_ERROR = 3e-5
+_MEAN_ERROR = 1e-4
 _SLOPE_ERROR = 1e-4
 
 
