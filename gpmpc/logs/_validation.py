@@ -8,7 +8,7 @@ import numpy as np
 
 from gpmpc.exceptions import DataError
 from gpmpc.logs._fitting import PAST, NominalFit
-from gpmpc.logs._folds import Fold
+from gpmpc.logs._folds import MANY_RUNS, Fold
 from gpmpc.logs._log import Log
 from gpmpc.logs._noise import fit_noise, learning_gains
 from gpmpc.logs._rollout_corrections import (
@@ -109,7 +109,9 @@ class Validations:
             models.append(self._correct(validation.model, structure, others))
         held_out = [validation.held_out for validation in validations]
         noise = fit_noise(models, held_out, self._steps)
-        if len(validations) == len(self._folds):
+        has_halves = len(validations) > len(self._folds)
+        # Of many runs, how unlike they are decides, not how many rows they have.
+        if not has_halves or len(self._log.runs) >= MANY_RUNS:
             return noise
         of_halves = self.models(structure)
         gains = learning_gains(
