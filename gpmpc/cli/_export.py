@@ -28,6 +28,7 @@ from gpmpc.export import (
     export_c,
     write_replay,
 )
+from gpmpc.export._checks import check_exportable
 from gpmpc.mpc import GPMPC, Reference
 from gpmpc.recording import Run, read_run
 from gpmpc.studies.flight import Experiment
@@ -106,7 +107,9 @@ def _controller_of(run: Run, experiment: Experiment) -> GPMPC:
             with one_thread(), errors_of_settings(run):
                 rows = experiment.training_rows()
                 model = experiment.learn(rows, experiment.seed).posterior
-    return experiment.controller(model)
+    controller = experiment.controller(model)
+    check_exportable(controller, experiment.on_failure)
+    return controller
 
 
 def _questions(

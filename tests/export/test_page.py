@@ -16,6 +16,15 @@ def test_the_ten_minutes_of_the_page(page, tmp_path):
     names, printed = page("docs/export.md")
     assert "other statuses" in printed[1]
     assert "with compiled" in printed[2]
+    assert "chosen |" in printed[3]
+    header = (tmp_path / "small/src/gpmpc.h").read_text()
+    kept = re.search(r"points: (\d+) of the 189 of the model", header)
+    assert kept
+    assert (
+        f"{kept[1]} of 189 points are kept"
+        in (tmp_path / "small/points.md").read_text()
+    )
+    assert names["choice"].points < 400
     program = next(
         text
         for language, text in BLOCK.findall(read("docs/export.md"))
