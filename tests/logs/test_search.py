@@ -220,6 +220,12 @@ def test_a_correction_upon_a_still_state_is_a_regression():
     ends = correction(windows, still) - still
     expected = ends[:, 0] + (ends[:, 9] - ends[:, 0]) * 4 / 9
     np.testing.assert_allclose(between, expected, atol=1e-12)
+    # After its last step it fades, to nothing at twice as many.
+    longer = log.windows(25, past=20)
+    rested = np.repeat(longer.states[:, 20:21], 25, axis=1)
+    moved = correction(longer, rested) - rested
+    np.testing.assert_allclose(moved[:, 14], moved[:, 9] / 2, atol=1e-12)
+    assert not moved[:, 19:].any()
 
 
 def test_a_correction_keeps_a_share_of_the_movement():
