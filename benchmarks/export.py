@@ -15,6 +15,7 @@ wind.
 With ``--check`` a build with clang's sanitizers of addresses and undefined behaviour
 answers every question as well, and the source is compiled strictly by gcc, linted by
 cppcheck, and held to libm alone (``benchmarks.export_checks``); a fault ends the run.
+Times of C then hold what it takes to hand the questions over.
 Printed for each: questions, the largest difference of an input, as a share of the
 input's range in brackets, other statuses, and the median time of a step of Python and
 of C alone [ms]. Writes ``outputs/benchmarks/export.json``.

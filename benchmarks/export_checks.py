@@ -45,6 +45,8 @@ LONG_TABLE = re.compile(r"(static const \w+ \w+\[\d+\] = \{)[^}]{400,}\}")
 # What compilers call beside libm where they copy or clear memory.
 MEMORY_FUNCTIONS = {"memcpy", "memset", "memmove", "__stack_chk_fail"}
 LINKER_TABLES = {"_GLOBAL_OFFSET_TABLE_"}
+# functions of math.h that glibc holds outside libm as well
+ELSEWHERE_TOO = {"copysign", "copysignf", "frexp", "ldexp", "modf", "scalbn"}
 
 
 def check_source(source: Path) -> list[str]:
@@ -62,7 +64,7 @@ def check_source(source: Path) -> list[str]:
     without_tables.write_text(LONG_TABLE.sub(r"\g<1>0}", source.read_text()))
     _run([*LINTER, str(without_tables)])
     needed = undefined_symbols(object_file)
-    foreign = [name for name in needed if not _is_allowed(name)]
+    foreign = foreign_symbols(needed)
     if foreign:
         raise RuntimeError(f"{source} needs {', '.join(foreign)}")
     return needed
@@ -74,13 +76,17 @@ def undefined_symbols(object_file: Path) -> list[str]:
     return sorted(line.split()[-1] for line in lines)
 
 
-def _is_allowed(name: str) -> bool:
-    """Returns whether libm has a function, or compilers call it for memory."""
-    if name in MEMORY_FUNCTIONS | LINKER_TABLES:
-        return True
-    return hasattr(ctypes.CDLL("libm.so.6"), name) and not hasattr(
-        ctypes.CDLL("libc.so.6"), name
-    )
+def foreign_symbols(names: list[str]) -> list[str]:
+    """Returns those of names that are not of libm, such as what allocates memory."""
+    libm = ctypes.CDLL("libm.so.6")
+    libc = ctypes.CDLL("libc.so.6")
+    allowed = MEMORY_FUNCTIONS | LINKER_TABLES | ELSEWHERE_TOO
+    foreign = []
+    for name in names:
+        is_of_libm = hasattr(libm, name) and not hasattr(libc, name)
+        if not is_of_libm and name not in allowed:
+            foreign.append(name)
+    return foreign
 
 
 class SanitizedReplay:
