@@ -11,9 +11,10 @@
 
 ``gpmpc.propagation._moments`` states the mathematics and serves torch; here the closed
 forms and their derivatives are evaluated for ``Packed`` arrays, on one thread.
-They belong to the k latent functions f of x~ = (x, u), with x ~ N(mu, S) and u certain;
-callers add the previous state, observation noise or a nearest semidefinite covariance.
-Every function takes H points along a first dimension, which all results have in front.
+The moments are those of the k latent functions f of x~ = (x, u), with x ~ N(mu, S) and
+u certain; callers add the previous state, observation noise or a nearest semidefinite
+covariance. Every function takes H points; every array below has H in front of the shape
+that is stated.
 Nothing is kept between calls: any number of threads may call at once.
 """
 

@@ -421,7 +421,8 @@ def _differentiate_pair(belief, a, b, terms, P_sum, pair, scratch, gradient):
     second_moments(pair.p_j, terms.z[b], scratch.row, Y)
     for c in range(n):
         project(pair.g[c], terms.z[b], cross[c])
-        for d in range(n if not same else 0):  # in g of a = b is R, not P
+        # for a = b, g was summed over R = P + U; for a != b U is added here
+        for d in range(n if not same else 0):
             cross[c, d] += terms.first[a, c] * terms.first[b, d]
     for c in range(n):
         for d in range(n):

@@ -34,7 +34,7 @@ class GPArrays(NamedTuple):
 
 
 class Precision(NamedTuple):
-    """(K + sn2 I)^-1 of k GPs in two forms, as lower triangles (k, size)."""
+    """(K + sn2 I)^-1 of k GPs in two forms, lower triangles of all entries (k, E)."""
 
     #: L_a^-1, four rows after four rows: of rows i to i + 3 the columns before i + 4,
     #: rounded up to a multiple of 8, with zeros above the diagonal
@@ -85,7 +85,7 @@ class Packed:
 
 
 def _inverse_by_four_rows(factor: Array, padded: int) -> Array:
-    """Returns the inverse of a factor as ``Precision.inverse_cholesky`` (size,)."""
+    """Returns the inverse of a factor as ``Precision.inverse_cholesky`` (E,)."""
     size = len(factor)
     square = np.zeros((padded, padded))
     square[:size, :size], _ = scipy.linalg.lapack.dtrtri(factor, lower=1)
@@ -96,7 +96,7 @@ def _inverse_by_four_rows(factor: Array, padded: int) -> Array:
 
 
 def _centred_by_blocks(factor: Array, beta: Array, padded: int) -> Array:
-    """Returns beta beta' - (L L')^-1 as ``Precision.centred`` (size,)."""
+    """Returns beta beta' - (L L')^-1 as ``Precision.centred`` (E,)."""
     size = len(factor)
     precision, _ = scipy.linalg.lapack.dpotri(factor, lower=1)  # the lower triangle
     square = np.zeros((padded, padded))

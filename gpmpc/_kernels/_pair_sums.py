@@ -68,8 +68,8 @@ def allocate_pair_terms(n, padded):
 def sum_pairs(pair, weights_i, weights_j, z_a, z_b, E, size, same, derivatives):
     """Writes the sums of ``pair``, from its other terms; returns sum_ij P_ij.
 
-    ``E`` is read for a = b (``same``). With ``derivatives`` alone are p_i and g sums;
-    without, p_i is of no meaning.
+    ``E`` is read for a = b (``same``). Sums p_i and g are written only with
+    ``derivatives``; without, p_i is of no meaning.
     """
     for d in range(len(z_a)):
         multiply_entries(weights_i, z_a[d], pair.weighted_z[d])

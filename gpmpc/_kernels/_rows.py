@@ -6,7 +6,7 @@ do so for the latency of an addition: four sums in turns hide it.
 
 from gpmpc._compiled import inline_njit, njit_noalloc
 from gpmpc._kernels._simd import (
-    larger,
+    larger_magnitude,
     largest,
     load,
     store,
@@ -96,7 +96,7 @@ def largest_square(rows):
         for d in range(len(rows)):
             x = load(rows[d], j)
             square = square + x * x
-        most = larger(most, square)
+        most = larger_magnitude(most, square)
     return largest(most)
 
 
@@ -106,7 +106,7 @@ def largest_size(row):
     use_widest_registers()
     most = zeros()
     for j in range(0, len(row), 8):
-        most = larger(most, load(row, j))
+        most = larger_magnitude(most, load(row, j))
     return largest(most)
 
 

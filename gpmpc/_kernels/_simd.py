@@ -191,7 +191,7 @@ def store(builder, array, index, values):
 
 
 @_define(LANES, LANES, LANES)
-def larger(builder, values, others):
+def larger_magnitude(builder, values, others):
     """Returns the larger ones of ``values`` and ``|others|``, entry by entry.
 
     The magnitude is that of ``others`` alone: ``values`` are a largest magnitude so

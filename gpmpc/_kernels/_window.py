@@ -36,9 +36,8 @@ V = -1
 class Window:
     """k GPs over N points, as ``linearize_gps`` takes them.
 
-    Begin with ``Window.empty``. Of its arrays, and of those that ``without`` returns,
-    only the data and the shapes count until ``append`` has written all rows: before,
-    the GPs do not predict.
+    Begin with ``Window.empty``. The GPs that it and ``without`` return predict only
+    once ``append`` has written all rows of their factor.
     """
 
     arrays: GPArrays  #: what predictions of the mean read
@@ -53,7 +52,7 @@ class Window:
     rows: int = 0  #: number of rows of L that are computed; N where the GPs predict
     #: whether a next window may write to ``columns``: one item, which the first takes;
     #: a list, since to take from it is one step also where threads share the window
-    _may_extend: list[None] = field(default_factory=lambda: [None])
+    _extension_token: list[None] = field(default_factory=lambda: [None])
 
     @classmethod
     def empty(
@@ -146,7 +145,7 @@ class Window:
         They are this window's own for the first that follows on it, else a copy.
         """
         try:
-            self._may_extend.pop()
+            self._extension_token.pop()
         except IndexError:
             columns = _no_columns(*self.columns.shape[:2])
             done = slice(self.rows)
@@ -222,7 +221,8 @@ def _write_factor_row(factor, i, q, noise, target):
     size = i // 8 * 8 + 8
     square = q[i] + noise  # becomes r^2
     y = target  # becomes y - w'v
-    for j in range(0, i, 4):  # columns from i on have zeros yet
+    # columns of L from i on are still zero, so the last group of four may pass i
+    for j in range(0, i, 4):
         c0 = factor[j]
         c1 = factor[j + 1]
         c2 = factor[j + 2]

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 # The operations, by CasADi's numbers for them. A new one has four places: its number
 # here, ``OPERATIONS``, ``TWO_OPERANDS`` if it has two, and ``_operate`` (eight points
-# at once) or ``_operate_rarely`` (one after the other).
+# at once) or ``_operate_on_scalars`` (one after the other).
 (
     ASSIGN,
     ADD,
@@ -235,7 +235,7 @@ def _operate(operation, a, b, work, free):
     store(work, free, a)
     store(work, free + 8, b)
     for lane in range(free, free + 8):
-        value, by_first, by_second = _operate_rarely(
+        value, by_first, by_second = _operate_on_scalars(
             operation, work[lane], work[lane + 8]
         )
         work[lane + 16] = value
@@ -251,7 +251,7 @@ def _over(a, b):
 
 
 @njit_noalloc
-def _operate_rarely(operation, a, b):
+def _operate_on_scalars(operation, a, b):
     """Does what ``_operate`` does for all other operations, on two numbers."""
     if operation == INV:
         return _over(1.0, a), _over(-1.0, a * a), 0.0
@@ -279,7 +279,7 @@ def _operate_rarely(operation, a, b):
 
 @njit_noalloc
 def _operate_exponential(operation, a):
-    """Does what ``_operate_rarely`` does, for exponentials and logarithms."""
+    """Does what ``_operate_on_scalars`` does, for exponentials and logarithms."""
     if operation == EXP:
         value = math.exp(a)
         return value, value, 0.0
@@ -294,7 +294,7 @@ def _operate_exponential(operation, a):
 
 @njit_noalloc
 def _operate_trigonometric(operation, a):
-    """Does what ``_operate_rarely`` does, for the tangent and inverse functions."""
+    """Does what ``_operate_on_scalars`` does, for the tangent and inverse functions."""
     if operation == TAN:
         value = math.tan(a)
         return value, 1.0 + value * value, 0.0
@@ -310,7 +310,7 @@ def _operate_trigonometric(operation, a):
 
 @njit_noalloc
 def _operate_hyperbolic(operation, a):
-    """Does what ``_operate_rarely`` does, for hyperbolic functions and inverse ones."""
+    """Does what ``_operate_on_scalars`` does, for hyperbolic and inverse functions."""
     if operation == TANH:
         value = math.tanh(a)
         return value, 1.0 - value * value, 0.0
@@ -329,8 +329,8 @@ def _operate_hyperbolic(operation, a):
 
 @njit_noalloc
 def _operate_piecewise(operation, a):
-    """Does what ``_operate_rarely`` does, for functions of steps and kinks."""
-    sign = 0.0
+    """Does what ``_operate_on_scalars`` does, for functions of steps and kinks."""
+    sign = a  # of zero, and of what is no number
     if a > 0.0:
         sign = 1.0
     if a < 0.0:
@@ -365,7 +365,7 @@ def _compare(operation, a, b):
 
 @njit_noalloc
 def _operate_on_pair(operation, a, b):
-    """Does what ``_operate_rarely`` does, for further functions of two numbers."""
+    """Does what ``_operate_on_scalars`` does, for further functions of two numbers."""
     if operation == ATAN2:
         squares = a * a + b * b
         return math.atan2(a, b), _over(b, squares), _over(-a, squares)

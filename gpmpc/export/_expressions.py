@@ -38,7 +38,7 @@ _UNARY: dict[int, str] = {
     tapes.ERF: "ERF({a})",
     tapes.FLOOR: "FLOOR({a})",
     tapes.CEIL: "CEIL({a})",
-    tapes.SIGN: "(real)(({a} > 0) - ({a} < 0))",
+    tapes.SIGN: "({a} > 0 ? 1 : {a} < 0 ? -1 : {a})",
     tapes.NOT: "(real)({a} == 0)",
 }
 _BINARY: dict[int, str] = {

@@ -37,7 +37,7 @@ from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_rescue import rescue
 from gpmpc.qp._primal_active_set import farkas_ray
-from gpmpc.qp._problem import ABSENT, QuadraticProgram
+from gpmpc.qp._problem import ABSENT, QuadraticProgram, check_positive
 from gpmpc.qp._solution import QPSolution, WarmStart, make_solution
 from gpmpc.status import Status
 
@@ -69,8 +69,8 @@ class CvxpySolver:
         tolerance: Largest scaled KKT residual of a solution called ``SOLVED``.
 
     Raises:
-        ProblemError: A solver that CVXPY does not find; the message lists those it
-            finds.
+        ProblemError: A solver that CVXPY does not find (the message lists those it
+            finds), or a tolerance that is not positive.
     """
 
     name: str = "CLARABEL"
@@ -80,6 +80,7 @@ class CvxpySolver:
     def __post_init__(self):
         import cvxpy
 
+        check_positive(self, "tolerance")
         installed = cvxpy.installed_solvers()
         if self.name not in installed:
             raise ProblemError(
@@ -117,7 +118,8 @@ class CvxpySolver:
             if solution.status is Status.INFEASIBLE:
                 return solution
             # no interior point reaches zero
-            residual = np.nan_to_num(max(solution.residuals(zero=1.0)), nan=np.inf)
+            residuals = solution.residuals(zero=1.0)
+            residual = np.nan_to_num(np.max(residuals), nan=np.inf)
             if solution.status is Status.SOLVED and residual <= self.tolerance:
                 return solution
             if best is None or residual < least:

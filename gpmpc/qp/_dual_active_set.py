@@ -27,7 +27,12 @@ from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_kernels import SIGNATURE, solve_kernel
 from gpmpc.qp._dual_rescue import rescue
-from gpmpc.qp._problem import QuadraticProgram, check_positive, multiplier_caps
+from gpmpc.qp._problem import (
+    QuadraticProgram,
+    check_limits,
+    check_positive,
+    multiplier_caps,
+)
 from gpmpc.qp._solution import QPSolution, WarmStart, as_record, proves_infeasibility
 from gpmpc.qp._workspace import new_memory, prepare_memory
 
@@ -64,9 +69,10 @@ class DualActiveSet:
 
     Args:
         tolerance: Largest residual of a solution called ``SOLVED``, as a share of its
-            size.
+            size. One that was computed in doubled digits is held to a tolerance of its
+            own (``gpmpc.qp._dual_rescue``).
         iteration_limit: Changes of the working set before ``ITERATION_LIMIT``; ample if
-            omitted.
+            omitted. Under a time limit it may be passed by up to 50 changes.
         time_limit: Seconds before ``TIME_LIMIT``; none if omitted.
 
     Raises:
@@ -81,10 +87,15 @@ class DualActiveSet:
     )
 
     def __post_init__(self):
-        check_positive(self, "tolerance", "iteration_limit", "time_limit")
+        check_positive(self, "tolerance")
+        check_limits(self, "iteration_limit", "time_limit")
         global _solve_unchecked
         compile_for(solve_kernel, SIGNATURE)
         _solve_unchecked = unchecked_entry_point(solve_kernel)
+
+    def __reduce__(self) -> tuple:
+        """Pickles the settings alone: another process has a memory of its own."""
+        return type(self), (self.tolerance, self.iteration_limit, self.time_limit)
 
     def solve(
         self,
@@ -119,7 +130,7 @@ class DualActiveSet:
                 if prices is None
                 else self._workplace(shape, prices)
             )
-        except (AttributeError, KeyError, TypeError):
+        except (AttributeError, KeyError, TypeError, ValueError):
             if not isinstance(problem, tuple):
                 got = type(problem).__name__
                 raise ProblemError(
@@ -142,7 +153,7 @@ class DualActiveSet:
             # not contiguous float64, or a warm start that is no solution of ours
             pass
         if status != _SOLVED:
-            problem, record = self._solve_again(
+            problem, record = self._finish(
                 problem, warm_start, workplace, status, record, began
             )
         seconds = perf_counter() - began
@@ -190,7 +201,7 @@ class DualActiveSet:
     def _limit(self, M: int) -> int:
         return self.iteration_limit or 100 + _ITERATIONS_PER_CONSTRAINT * M
 
-    def _solve_again(
+    def _finish(
         self,
         problem: QuadraticProgram,
         warm_start: WarmStart,
@@ -199,7 +210,7 @@ class DualActiveSet:
         record: Array,
         began: float,
     ) -> tuple[QuadraticProgram, Array]:
-        """Continues a solve that did not end as ``SOLVED``.
+        """Finishes a solve that did not end as ``SOLVED``.
 
         Checks the problem, iterates on within the limits, and accepts the result or
         tries again from its working set, then with doubled digits.
@@ -235,19 +246,20 @@ class DualActiveSet:
         record[layout.ITERATIONS] = iterations
         if status == layout.ITERATION_LIMIT and late():
             record[layout.STATUS] = layout.TIME_LIMIT
-        stopped = status == layout.ITERATION_LIMIT and self.iteration_limit is not None
-        if stopped or _is_certain(record, problem):
+        is_at_limit = status == layout.ITERATION_LIMIT
+        reached_own_limit = is_at_limit and self.iteration_limit is not None
+        if reached_own_limit or _is_final(record, problem):
             return problem, record
 
         # A second try from the last working set. Its factor is computed anew, as only
         # a solved record hands its factor on. The kernel reads one record and writes
-        # another, which stays a copy if the kernel refuses the program again; what
-        # counts of its status is in the record.
+        # another, which stays a copy if the kernel refuses the program again; the
+        # status is in the record.
         guess = record
         record = record.copy()
         solve_kernel(*problem, guess, memory, record)
         record[layout.ITERATIONS] += iterations
-        if not _is_certain(record, problem):
+        if not _is_final(record, problem):
             record = rescue(problem, caps, record, limit, late)
         return problem, record
 
@@ -255,7 +267,8 @@ class DualActiveSet:
 class Prepared:
     """A problem whose P and G stay the same.
 
-    Made by ``DualActiveSet.prepare``; read-only, so that it may serve many threads.
+    Made by ``DualActiveSet.prepare``. Nothing of it can be set. Threads may share it: a
+    solve keeps the interpreter's lock, and so its memory to itself.
     """
 
     __slots__ = ("_G", "_P", "_solver", "_workplace")
@@ -282,8 +295,8 @@ class Prepared:
 
         Args:
             q: (n,).
-            lower: (n + m,) lower bounds of x, then of the rows of G; infinite or below
-                -1e20 where absent.
+            lower: (n + m,) lower bounds of x, then of the rows of G; infinite, or -1e20
+                or below, where absent.
             upper: (n + m,) upper bounds likewise.
             warm_start: The last solution, or an active set; any guess is safe.
 
@@ -308,7 +321,7 @@ class Prepared:
             pass
         problem = P, q, G, lower, upper
         if status != _SOLVED:
-            problem, record = self._solver._solve_again(
+            problem, record = self._solver._finish(
                 QuadraticProgram.unchecked(P, q, G, lower, upper),
                 warm_start,
                 self._workplace,
@@ -320,7 +333,7 @@ class Prepared:
         return _new(QPSolution, (record[x_slice], problem, caps, record, 0.0, seconds))
 
 
-def _is_certain(record: Array, problem: QuadraticProgram) -> bool:
+def _is_final(record: Array, problem: QuadraticProgram) -> bool:
     """Returns whether a record needs no second look.
 
     An infeasible one needs Farkas' proof.

@@ -7,9 +7,9 @@ working set W the minimiser over ``c_p'x = b_p, p in W`` is
 
 where x_u is the unconstrained minimiser, y = C x_u and K = C P^-1 C'. The method keeps
 every multiplier in its range and moves to the most violated constraint p until none is
-violated (algorithm 1). A multiplier at its cap, the price of a soft row, leaves with a
-constraint that stays violated; then mu_p is not zero outside the working set, and x_u
-is the minimiser with the multipliers at caps added to q.
+violated (their algorithm 1). A multiplier at its cap, the price of a soft row, leaves
+with a constraint that stays violated; then mu_p is not zero outside the working set,
+and x_u is the minimiser with the multipliers at caps added to q.
 
 The functions take a workspace (``gpmpc.qp._workspace``) and the number k of its working
 constraints; those that change k return it.
@@ -76,45 +76,56 @@ class Progress(NamedTuple):
 
 
 @inline_njit
-def iterate(work, k, starts, guessed, count, margin, iterations, batches_left):
+def iterate(
+    work,
+    k,
+    is_first_look,
+    guessed_count,
+    violated_count,
+    margin,
+    iterations,
+    batches_left,
+):
     """Adds and drops constraints until none is violated by more than ``margin``.
 
-    Where ``starts``, which constraints are violated is not known yet: the first
-    ``guessed`` candidates enter before all else. Otherwise ``count`` violated ones are
-    listed; their excess and the margin are in units of ``norm``. ``iterations`` are the
-    changes of the working set so far. Up to ``batches_left`` times several constraints
-    enter at once.
+    At the first look it is not known yet which constraints are violated: the first
+    ``guessed_count`` candidates enter before all else. Later ``violated_count`` of them
+    are listed; their excess and the margin are in units of ``norm``. ``iterations`` are
+    the changes of the working set so far. Up to ``batches_left`` times several
+    constraints enter at once.
     """
     p = 0
-    candidates = guessed
+    candidates = guessed_count
     status = SOLVED
     violated = False
     passed_over = False
     all_listed = True  # whether the list was made of all constraints
-    while starts or count > 0:
+    while is_first_look or violated_count > 0:
         # select the violated constraint p, or several at once: the candidates
-        if not starts:
+        if not is_first_look:
             violated = True
             if iterations >= work.limit:
                 status = ITERATION_LIMIT
                 break
-            p = most_violated(work, count)
+            p = most_violated(work, violated_count)
             candidates = 0
             if all_listed and batches_left > 0:
                 threshold = _BADLY * work.excess[p]
-                candidates = choose_badly_violated(work, threshold, count, work.n - k)
+                candidates = choose_badly_violated(
+                    work, threshold, violated_count, work.n - k
+                )
                 batches_left -= candidates > 0
 
         # add the candidates, or move to p, which enters unless it stays violated
         size_before = k
         k = add_candidates(work, k, candidates)
-        multipliers_fit = False
-        single = not starts and k == size_before
+        must_solve_multipliers = True
+        single = not is_first_look and k == size_before
         if single:
             multiplier_before = work.multiplier[p]
             satisfied, k, changes = _satisfy_constraint(work, k, p)
             iterations += changes
-            multipliers_fit = True
+            must_solve_multipliers = False
             if not satisfied:
                 terms = _terms_of_combination(work, k)
                 if _is_contradiction(work, p, terms):
@@ -126,32 +137,33 @@ def iterate(work, k, starts, guessed, count, margin, iterations, batches_left):
                 work.negligible[p] += _ROUNDING_OF_BOUNDS * terms
                 ignore_violations(work, p)
                 passed_over = True
-                # they do not; but where a cap has moved x_u, ``free_value`` cannot
-                # correct them: that is left to refinement
-                multipliers_fit = work.soft != 0.0
+                # with soft rows ``free_value`` is that of before x_u moved: there
+                # refinement corrects the multipliers
+                must_solve_multipliers = work.soft == 0.0
             if work.soft != 0.0:
                 # p may have reached its cap, which moves x_u; several at once need
                 # the ``free_value`` of before
                 batches_left = 0
-        elif not starts:
+        elif not is_first_look:
             iterations += k - size_before
 
         # put the multipliers into their ranges, and x where they have their minimum
-        if not multipliers_fit:
+        if must_solve_multipliers:
             k = _drop_wrong_multipliers(work, k)
         _minimise(work, k)
 
-        # first satisfy those that were seen to be violated, then look at all: at once
-        # where none of them is left, rows are soft, or it is the last look
-        look_at_all = count == 1 or work.soft != 0.0 or iterations >= work.limit
-        all_listed = look_at_all or not single
+        # first satisfy the others that were seen to be violated, then look at all
+        was_last_listed = violated_count == 1
+        is_last_look = iterations >= work.limit
+        looks_at_all = was_last_listed or work.soft != 0.0 or is_last_look
+        all_listed = looks_at_all or not single
         if not all_listed:
-            count = recheck_violated(work, margin, count)
-            all_listed = count == 0
+            violated_count = recheck_violated(work, margin, violated_count)
+            all_listed = violated_count == 0
         if all_listed:
             multiply_constraints(work)
-            count = list_violated(work, margin)
-        starts = False
+            violated_count = list_violated(work, margin)
+        is_first_look = False
     if status == SOLVED and violated:
         _clip_multipliers(work, k)
     return Progress(
@@ -219,7 +231,9 @@ def _satisfy_constraint(work, k, p):
             k -= 1
             restore_limits(work, leaving)
             violation -= step * d
-        elif capped:  # a soft row that stays violated
+        elif capped:
+            # mu_p is at an end of its range: p stays outside the working set, violated
+            # at its cap or satisfied at zero
             mu[p] = range_end
             restore_limits(work, p)
             return True, k, changes

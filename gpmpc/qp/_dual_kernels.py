@@ -17,7 +17,7 @@ from gpmpc._compiled import compiled, inline_njit
 from gpmpc._kernels._simd import (
     any_nonzero,
     clip,
-    larger,
+    larger_magnitude,
     largest,
     load,
     load_some,
@@ -70,19 +70,19 @@ NEGLIGIBLE = 1e-26
 _LARGEST_BOUND = np.nextafter(ABSENT, 0.0)
 # A constraint that depends on others may be left with this violation: see
 # ``worst_violation``.
-_NOISE = 2e-14
+_TOLERATED_IF_DEPENDENT = 2e-14
 # A violation up to this share of the length of q waits for the refined x.
-_LATER = 1e-11
+_FIRST_MARGIN = 1e-11
 _ROUNDS = 10  # returns from the residuals to the iteration
 # Residuals at which refinement stops: at first, and where x is to be as good as can be.
 _FINE = 2e-10
 _FINEST = 1e-15
-# The largest residual of a solution is this multiple of the share that cancellation
-# left of the pivots; with a smaller share than the second, x is to be as good as can
-# be from the first round on.
-_DOUBT = 3e-7
-_ILL = 5e-4
-_OLD = 1000  # changes after which a factor is computed anew
+# The largest residual of a solution, as a multiple of the share that cancellation left
+# of the pivots.
+_RESIDUAL_PER_PIVOT_SHARE = 3e-7
+# With a smaller share of the pivots x is to be as good as can be from the first round.
+_ILL_CONDITIONED_SHARE = 5e-4
+_REFACTORISE_AFTER = 1000  # changes of the working set
 
 
 @compiled(allocates=False, locked=True)
@@ -91,6 +91,9 @@ def solve_kernel(P, q, G, lower, upper, guess, memory, out):
 
     The memory of a prepared program holds the factor of its P already, and is not to be
     used with another P or G; that of others has P factorised at each solve.
+
+    It returns ``MISUSE``, and writes no record, where shapes do not match, arrays are
+    not contiguous, bounds are crossed or numbers overflow.
 
     Args:
         P: (n, n) symmetric positive definite.
@@ -197,7 +200,7 @@ def _length_of_q(work):
     undefined = zeros()
     for j in range(0, work.n, 8):
         length = load_some(work.q, j) * load(work.norm, j)
-        longest = larger(longest, length)
+        longest = larger_magnitude(longest, length)
         undefined = undefined + 0.0 * length
     return np.inf if any_nonzero(undefined) else largest(longest)
 
@@ -212,11 +215,11 @@ def _read_bounds(work, lower, upper):
     for p in range(0, len(lower), 8):
         low = _remove_absent(load_some(lower, p))
         high = _remove_absent(load_some(upper, p))
-        # infinity less infinity is undefined, and so none of a bound
+        # both infinite with one sign: NaN, which counts as wrong
         wrong = wrong + clip(high - low, -1.0, 0.0)
         negligible = work.negligible_length * load(work.norm, p)
-        below = TOLERATED * larger(zeros(), low) + negligible
-        above = TOLERATED * larger(zeros(), high) + negligible
+        below = TOLERATED * larger_magnitude(zeros(), low) + negligible
+        above = TOLERATED * larger_magnitude(zeros(), high) + negligible
         store(work.lower, p, low)
         store(work.upper, p, high)
         store(work.negligible, p, negligible)
@@ -252,7 +255,7 @@ def _solve_opened(work, guess, out):
     if len(guess) > 0 and guess[STATUS] == ITERATION_LIMIT:
         batches_left = 0  # only single steps let the dual objective rise for sure
 
-    margin = _LATER * work.length_of_q  # small violations wait for the refined x
+    margin = _FIRST_MARGIN * work.length_of_q  # small violations wait for the refined x
     first_round = True
     rounds = 0
     count = 0  # of the listed violated constraints
@@ -276,13 +279,13 @@ def _solve_opened(work, guess, out):
                 break
         first_round = False
 
-        # refine x, as good as can be where that is in doubt, and judge it; it stays
-        # where the iteration saw no violation at a margin of zero. Written out here:
-        # a function that returns a record of all this costs 9 s of compilation
+        # refine x, as good as can be where that is in doubt, and judge it. The loop
+        # ends here if nothing changed since violations were listed at a margin of zero.
+        # Written out: a function that returns all this costs 9 s of compilation
         _put_on_bounds(work, k)
         pivot_share = min(work.pivot_share, math.sqrt(_least_pivot_share(work, k)))
-        finest = finest or passed_over or pivot_share < _ILL
-        largest_residual = _DOUBT * pivot_share
+        finest = finest or passed_over or pivot_share < _ILL_CONDITIONED_SHARE
+        largest_residual = _RESIDUAL_PER_PIVOT_SHARE * pivot_share
         refined = refine(work, k, min(_FINEST if finest else _FINE, largest_residual))
         accurate = refined.residual <= min(work.tolerance, largest_residual)
         status = SOLVED if accurate else NUMERICAL_TROUBLE
@@ -294,8 +297,8 @@ def _solve_opened(work, guess, out):
         margin = 0.0
         changed = False
 
-        # list what the refined x violates. Its error may hide a violation: before x is
-        # as good as can be, those that are less than the error from it are listed, too
+        # list what the refined x violates. Before x is as good as can be its error may
+        # hide a violation: rows that hold by less than the error are listed, too
         error = refined.residual * refined.length / pivot_share
         count = list_violated(work, -0.0 if finest else -error)
         if count == 0:
@@ -305,7 +308,7 @@ def _solve_opened(work, guess, out):
             count = 0
             changed = True
     unsure = passed_over or rounds == _ROUNDS  # of the violations that are left
-    if unsure and status == SOLVED and worst_violation(work) > _NOISE:
+    if unsure and status == SOLVED and worst_violation(work) > _TOLERATED_IF_DEPENDENT:
         status = NUMERICAL_TROUBLE
     _write_record(work, k, status, iterations, age + iterations, out)
     return status
@@ -339,7 +342,7 @@ def _start(work, guess, record_size):
         factor_is_known = (
             is_prepared(work)
             and guess[TAG] == work.tag
-            and guess[AGE] < _OLD
+            and guess[AGE] < _REFACTORISE_AFTER
             and len(guess) == record_size
         )
         if factor_is_known and candidates == len(labels) and candidates <= n:

@@ -36,7 +36,7 @@ from scipy.optimize import linprog
 from gpmpc._calls import explains_arguments
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_rescue import rescue
-from gpmpc.qp._problem import ABSENT, QuadraticProgram, check_positive
+from gpmpc.qp._problem import ABSENT, QuadraticProgram, check_limits, check_positive
 from gpmpc.qp._solution import (
     QPSolution,
     WarmStart,
@@ -98,7 +98,8 @@ class PrimalActiveSet:
     iteration_limit: int | None = None
 
     def __post_init__(self):
-        check_positive(self, "tolerance", "iteration_limit")
+        check_positive(self, "tolerance")
+        check_limits(self, "iteration_limit")
 
     @np.errstate(over="ignore", invalid="ignore")  # what is not finite is seen below
     def solve(

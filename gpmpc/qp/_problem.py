@@ -255,9 +255,15 @@ def multiplier_caps(prices: ArrayLike | None, variables: int, rows: int) -> Arra
 
 
 def check_positive(settings: object, *names: str) -> None:
-    """Raises ``ProblemError`` unless settings of a solver are positive or None."""
+    """Raises ``ProblemError`` unless settings of a solver are positive numbers."""
     for name in names:
         value = getattr(settings, name)
         is_number = isinstance(value, int | float | np.number)
-        if value is not None and not (is_number and value > 0):
+        if not (is_number and value > 0):
             raise ProblemError(f"{name} must be positive; got {value}")
+
+
+def check_limits(settings: object, *names: str) -> None:
+    """Raises ``ProblemError`` unless limits of a solver are positive or None."""
+    names = tuple(name for name in names if getattr(settings, name) is not None)
+    check_positive(settings, *names)

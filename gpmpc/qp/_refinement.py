@@ -10,7 +10,15 @@ from typing import NamedTuple
 import numpy as np
 
 from gpmpc._compiled import inline_njit
-from gpmpc._kernels._simd import larger, largest, load, load_some, store, total, zeros
+from gpmpc._kernels._simd import (
+    larger_magnitude,
+    largest,
+    load,
+    load_some,
+    store,
+    total,
+    zeros,
+)
 from gpmpc._kernels.linalg import dot, multiply
 from gpmpc.qp._dual_iteration import add_multipliers, multiply_constraints
 from gpmpc.qp._triangular import (
@@ -64,9 +72,9 @@ def _measure_residual(work, k):
 
     The residual is that of stationarity and of the working constraints. The length is
     that in the metric of P, at least ``negligible_length``, so that neither the units
-    of the data nor a cost of another size hide an error of x. A hundredth of the error
-    is also measured by the largest entry of x, and that of a row by its bound or its
-    own terms.
+    of the data nor a cost of another size hide an error of x. The error
+    beside the largest entry of x counts, too, divided by 100, and that of a row beside
+    its bound or its own terms.
     ``UNDEFINED`` where a number that it is made of is not finite: comparisons alone
     would pass over NaN.
 
@@ -86,9 +94,9 @@ def _measure_residual(work, k):
         entry = load_some(gradient[:n], j) + load_some(work.slope[:n], j)
         store(gradient, j, entry)
         step = entry * load(work.norm, j)
-        steps = larger(steps, step)
-        shifts = larger(shifts, step * load(work.norm, j))
-        entries = larger(entries, load_some(x[:n], j))
+        steps = larger_magnitude(steps, step)
+        shifts = larger_magnitude(shifts, step * load(work.norm, j))
+        entries = larger_magnitude(entries, load_some(x[:n], j))
         nothing = nothing + 0.0 * step
     worst = largest(steps) / length
     undefined = total(nothing)

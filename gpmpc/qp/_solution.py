@@ -27,9 +27,8 @@ class Residuals(NamedTuple):
     All three are zero at the minimiser.
 
     Each is relative to the numbers that it is a sum of, so that neither units nor data
-    of another size hide it. Where these cancel, zero is what is small beside x, or very
-    small beside the free minimiser, in the metric of P's diagonal (1e-4 and 1e-12 of
-    them).
+    of another size hide it. Where these cancel, what counts as zero is 1e-4 of the
+    length of x, or 1e-12 of that of the free minimiser, in the metric of P's diagonal.
     """
 
     #: the largest violation of a hard constraint, or of a soft one beyond what its
@@ -187,8 +186,9 @@ class QPSolution(NamedTuple):
         P, q, _, lower, upper = self.arrays
         x = self.x
         multipliers = self.multipliers
-        up = multipliers > 0
-        down = multipliers < 0
+        # a multiplier of an absent bound is wrong: ``dual`` says by how much
+        up = (multipliers > 0) & (upper < ABSENT)
+        down = (multipliers < 0) & (lower > -ABSENT)
         at_upper = multipliers[up] * upper[up]
         at_lower = multipliers[down] * lower[down]
         capped = (np.abs(multipliers) >= self.caps) & np.isfinite(self.caps)
@@ -259,6 +259,9 @@ def make_solution(
         iterations: The solver's own count.
         build_seconds: Time spent on building or compiling the problem [s].
         solve_seconds: Time spent on solving it [s].
+
+    Raises:
+        ProblemError: Arrays of other shapes.
     """
     x = np.asarray(x, dtype=float)
     multipliers = np.asarray(multipliers, dtype=float)
@@ -269,9 +272,9 @@ def make_solution(
             f"a solution needs x of shape {(n,)} and multipliers {(M,)}; "
             f"got {x.shape}, {multipliers.shape}"
         )
-    record = layout.warm_record(
-        np.nan_to_num(np.sign(multipliers) if active_set is None else active_set), n
-    )
+    if active_set is None:
+        active_set = np.sign(multipliers)
+    record = layout.warm_record(_read_active_set(active_set, M), n)
     record[[layout.STATUS, layout.ITERATIONS]] = (
         layout.STATUSES.index(status),
         iterations,
@@ -292,13 +295,22 @@ def as_record(warm_start: WarmStart, n: int, M: int) -> Array:
         return layout.NO_RECORD
     if isinstance(warm_start, QPSolution):
         return np.ascontiguousarray(warm_start.record, dtype=np.float64)
-    active = np.asarray(warm_start)
-    if active.shape != (M,) or active.dtype.kind not in "biuf":
+    return layout.warm_record(_read_active_set(warm_start, M), n)
+
+
+def _read_active_set(active_set: ArrayLike, M: int) -> Array:
+    """Returns an active set (M,) as numbers; NaN counts as no bound.
+
+    Raises:
+        ProblemError: It has another shape, or holds no numbers.
+    """
+    active = np.asarray(active_set)
+    if active.shape != (M,) or active.dtype.kind not in "iuf":
         raise ProblemError(
-            f"a warm start must be a solution or an active set of shape {(M,)}; "
-            f"got shape {active.shape}"
+            f"a warm start must be a solution or an active set of shape {(M,)}, "
+            f"-1, 0 or +1 by constraint; got shape {active.shape} of {active.dtype}"
         )
-    return layout.warm_record(np.nan_to_num(active), n)
+    return np.nan_to_num(active.astype(float))
 
 
 @np.errstate(all="ignore")  # what is not finite proves nothing
@@ -332,7 +344,7 @@ def proves_infeasibility(ray: Array, G: Array, lower: Array, upper: Array) -> bo
 def zero_row_size(G: Array, lower: Array, upper: Array) -> float:
     """Returns the size of the numbers that cancelled in a zero row.
 
-    It is that of the other bounds, but at most one.
+    It is that of the other bounds, but at most one; one where there are no others.
     """
     others = np.append(np.ones(G.shape[1], dtype=bool), G.any(axis=1))
     sizes = np.abs(np.concatenate([lower[others], upper[others]]))

@@ -195,28 +195,30 @@ def delete_row(L, k, gone, solved, cosines, sines):
     Givens rotations restore the triangle (Golub and Van Loan, Matrix Computations, 4th
     ed., section 6.5.2); ``cosines`` and ``sines`` (k,) are scratch.
     """
-    left = solved[gone]
+    rotated_entry = solved[gone]
     for i in range(gone + 1, k):
         row = L[i]
         above = L[i - 1]
-        rest = L[i, gone]
+        rotated_column = L[i, gone]
         below = solved[i]
         for j in range(gone):
             above[j] = row[j]
         for j in range(gone + 1, i):
             entry = row[j]
-            above[j - 1], rest = (
-                cosines[j] * rest + sines[j] * entry,
-                cosines[j] * entry - sines[j] * rest,
+            above[j - 1], rotated_column = (
+                cosines[j] * rotated_column + sines[j] * entry,
+                cosines[j] * entry - sines[j] * rotated_column,
             )
         diagonal = 1.0 / row[i]
-        reciprocal = 1.0 / math.sqrt(rest * rest + diagonal * diagonal)
-        cosines[i] = rest * reciprocal
+        reciprocal = 1.0 / math.sqrt(
+            rotated_column * rotated_column + diagonal * diagonal
+        )
+        cosines[i] = rotated_column * reciprocal
         sines[i] = diagonal * reciprocal
         above[i - 1] = reciprocal
-        solved[i - 1], left = (
-            cosines[i] * left + sines[i] * below,
-            cosines[i] * below - sines[i] * left,
+        solved[i - 1], rotated_entry = (
+            cosines[i] * rotated_entry + sines[i] * below,
+            cosines[i] * below - sines[i] * rotated_entry,
         )
 
 

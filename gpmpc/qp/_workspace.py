@@ -1,8 +1,12 @@
 """The memory of the dual active-set kernels, and the fields by which they read it.
 
+*Memory* is one matrix that solves work in, the *workspace* the view of it that compiled
+code has, and a *record* what a solve leaves behind (``gpmpc.qp._record``).
+
 Asking the system for memory costs as much as a small solve, so each shape of a program
-(and each prepared program) keeps one matrix, its *memory*. Threads may share it, since
-a solve keeps the interpreter's lock. Its rows, all padded to the same length, are
+without prices, and each prepared program, keeps its own. Threads may share it, since a
+solve keeps the interpreter's lock. The rows of memory, all padded to the same length,
+are
 
     settings (1) | vectors (25) | integer vectors (4) | L | factor | rows | K
 
@@ -46,8 +50,8 @@ VECTORS = (
     # By constraint p < M, box first: C = [I; G], M = n + m. Absent bounds are infinite.
     "lower",
     "upper",
-    "allowed_low",  # outside [allowed_low, allowed_high] a constraint is violated,
-    "allowed_high",  # which a working one cannot be
+    "allowed_low",  # outside [allowed_low, allowed_high] a constraint is violated;
+    "allowed_high",  # infinite for working ones, so that they never are
     "negligible",  # violation of a bound of zero that is none: norm * negligible_length
     "norm",  # length of the vector of c_pj / sqrt(P_jj), j < n
     "cap",  # price of a violation: the largest size of a multiplier

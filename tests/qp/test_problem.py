@@ -171,7 +171,12 @@ def test_prices_are_positive_numbers_one_for_each_row(prices, message):
 @pytest.mark.parametrize("solver", [DualActiveSet, PrimalActiveSet])
 @pytest.mark.parametrize(
     "settings",
-    [{"tolerance": 0.0}, {"iteration_limit": -1}, {"tolerance": float("nan")}],
+    [
+        {"tolerance": 0.0},
+        {"tolerance": None},
+        {"iteration_limit": -1},
+        {"tolerance": float("nan")},
+    ],
 )
 def test_settings_that_make_no_sense_are_refused(solver, settings):
     with pytest.raises(ProblemError, match="must be positive"):
@@ -182,6 +187,8 @@ def test_settings_that_make_no_sense_are_refused(solver, settings):
 def test_a_warm_start_of_another_shape_is_misuse(solver):
     with pytest.raises(ProblemError, match="warm start"):
         solver.solve(QuadraticProgram(EYE, [0.0, 0.0]), np.ones(5))
+    with pytest.raises(ProblemError, match="-1, 0 or"):
+        solver.solve(QuadraticProgram(EYE, [0.0, 0.0]), np.array([True, False]))
 
 
 @pytest.mark.parametrize("size", [1.0, 1e6])

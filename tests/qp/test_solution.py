@@ -1,3 +1,5 @@
+import pickle
+
 import numpy as np
 import pytest
 
@@ -64,10 +66,32 @@ def test_a_multiplier_of_an_absent_bound_is_a_dual_residual():
     assert make_solution(problem, Status.SOLVED, [0.0], [-1.0]).residuals().dual == 1.0
 
 
+@pytest.mark.parametrize("absent", [-np.inf, -1e20])
+def test_a_rounded_multiplier_of_an_absent_bound_is_no_gap(absent):
+    """An interior-point solver leaves 1e-16 where there is no bound."""
+    problem = QuadraticProgram([[1.0]], [1.0], lb=[absent], ub=[5.0])
+    claim = make_solution(problem, Status.SOLVED, [-1.0], [-1e-16])
+    assert claim.residuals().gap == 0.0
+    assert claim.is_optimal()
+
+
+def test_a_solver_of_another_process_solves_to_the_same_bits(solved):
+    problem, solution = solved
+    solver = DualActiveSet(tolerance=1e-8, iteration_limit=500)
+    solver.solve(problem)
+    copied = pickle.loads(pickle.dumps(solver))
+    assert copied == solver
+    assert copied.solve(problem).x.tobytes() == solution.x.tobytes()
+
+
 def test_parts_of_the_wrong_shape_are_refused(solved):
     problem, solution = solved
     with pytest.raises(ProblemError, match="a solution needs x of shape"):
         make_solution(problem, Status.SOLVED, solution.x[:-1], solution.multipliers)
+    with pytest.raises(ProblemError, match="active set of shape"):
+        make_solution(
+            problem, Status.SOLVED, solution.x, solution.multipliers, active_set=[1]
+        )
 
 
 def test_a_solution_survives_being_made_from_its_parts(solved):
