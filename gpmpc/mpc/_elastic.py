@@ -7,14 +7,14 @@ be it the vehicle. There a price is taken that cannot outweigh what the cost is 
 with J0 and V0 the cost and the violations, all in all, of the plan without elastic
 bounds, at
 
-    price = WORTH J / V0,   J0 <= J <= 2 J0
+    price = WORTH (J + J_move) / V0,   J0 <= J <= 2 J0
 
 no plan that is better under it costs more than J0 + WORTH J, at most five times J0:
 that is what its violations may cost. J is the cost of the last plan within these
 limits: where that keeps the bound at some cost, the bound is worth more. A plan that
-costs nothing has no scale; what it would cost to be beside its reference by its
-violations is added. A direction that the cost does not weigh counts there as its
-largest weight does: else a bound in it would count for nothing.
+costs nothing has no scale: J_move is what it would cost to be beside its reference by
+its violations. A direction that the cost does not weigh counts there as its largest
+weight does: else a bound in it would count for nothing.
 
 This is the least price. The linearised program may promise more than the vehicle can
 do: as long as a plan that the model itself rolls out costs at most a SHARE of J0 more,

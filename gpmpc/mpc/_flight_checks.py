@@ -544,7 +544,7 @@ def _follow_promise(flight, distance, promised, horizon):
     if k > 0:  # one wrong measurement costs nothing
         nearer = min(nearer, flight.distances[(k - 1) % _RING])
     flight.paid[slot] = nearer * nearer
-    # What noise costs was not promised, nor what is done early for what came later.
+    # Noise was not promised, nor what prepares for a reference that is known later.
     allowed = flight.promised[slot] + 0.25 * h * distance.least * distance.least
     is_comparable = min(horizon, _LONG) == h
     flight.promised[slot] = promised if is_comparable else np.nan

@@ -29,7 +29,7 @@ Array = np.ndarray
 
 _HORIZONS = 4  # a flight takes at most so many horizons of the controller,
 _STAGES = 200  # or so many stages, where these are more
-_HELD = 6  # the goal counts as held after this part of a horizon near it,
+_HOLDING_PART = 6  # the goal counts as held after this part of a horizon near it,
 _FEWEST = 3  # but not after fewer stages
 _NEAR_GOAL = 0.01  # share of the dearest stage's cost that a stage near the goal has
 _STANDSTILL = 0.01  # share by which costs differ where the plant stands still
@@ -106,7 +106,7 @@ class Foresight:
         self.longest = max(_HORIZONS * controller.horizon, _STAGES)
         self._model = controller.prediction.model
         self._roll_out = RollOut(self._model)
-        self._hold = max(_FEWEST, controller.horizon // _HELD)
+        self._holding_stages = max(_FEWEST, controller.horizon // _HOLDING_PART)
         horizons = (controller.horizon // 2, controller.horizon // 4)
         shorter = [
             self._with_horizon(horizon, controller.iterations, controller.tolerance)
@@ -147,10 +147,10 @@ class Foresight:
 
         ``dearest`` is the cost of a stage before, where one is known.
         """
-        if len(costs) < self._hold:
+        if len(costs) < self._holding_stages:
             return False
         limit = _NEAR_GOAL * max(dearest, float(costs.max()))
-        return bool((costs[-self._hold :] <= limit).all())
+        return bool((costs[-self._holding_stages :] <= limit).all())
 
     def fly(
         self, beginning: Trajectory, question: Question, limit: float = np.inf
@@ -177,7 +177,7 @@ class Foresight:
                 return None
         return None
 
-    def hold(self, flight: Flight, question: Question) -> Flight:
+    def prolong(self, flight: Flight, question: Question) -> Flight:
         """Returns a flight and a horizon more, as the controller steers from its end.
 
         It is the flight itself where the controller fails.
@@ -196,7 +196,7 @@ class Foresight:
 
         They are as many as the goal is to be held for.
         """
-        last = costs[-self._hold :]
+        last = costs[-self._holding_stages :]
         return bool(np.ptp(last) <= _STANDSTILL * last.max())
 
     def step(self, state: Array, input: Array, question: Question) -> Array:

@@ -115,8 +115,9 @@ def initial_guess(prediction: PredictionModel, request: Request) -> Plan:
 
     Without one it is a line from the state to the last reference along the others, and
     its inputs are the previous one, or the reference's where R weighs deviations.
-    Inputs handed over alone lead to the model's states; where these are not finite, the
-    plan's are x_0. The form ``velocity`` holds the belief and the previous input.
+    Inputs handed over alone lead to the model's states; where these are not finite, all
+    states of the plan are x_0. The form ``velocity`` holds the belief and the previous
+    input.
     """
     if prediction.is_held:
         return _hold_belief(prediction, request)

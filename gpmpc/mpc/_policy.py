@@ -68,8 +68,9 @@ class Command:
     #: of the controller, with this status; None where it was not called or returned
     #: inputs of another shape
     decision: Decision | None
-    #: the last applicable decision, shifted to this step; before the first one that is
-    #: not, with what was applied as its ``input``; None where nothing was
+    #: what the next step goes on from: the decision that is applied now, or the last
+    #: applicable one, shifted to this step. Before any was: one that is not applicable,
+    #: whose ``input`` is what was applied. None where nothing was
     plan: Decision | None
     #: that the step began in (n,), of a model whose state holds its past; None of
     #: others. ``plan`` is of this state, ``decision`` of what is measured of it

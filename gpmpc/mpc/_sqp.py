@@ -77,7 +77,7 @@ _NEARLY = 5.0  # tolerances, within which an iteration that stalls has arrived
 _TINY = 1e-300
 
 
-class PriceTerms(NamedTuple):
+class MeritTerms(NamedTuple):
     """References and prices, which a cost needs besides its weights."""
 
     references: References
@@ -159,14 +159,15 @@ def measure_continuity(
     proposed: Plan,
     row_prices: Array,
 ) -> tuple[bool, float]:
-    """Tells whether a step is one more along the last plan.
+    """Tells whether a step goes on along the last plan, so that one program is enough.
 
-    Also returns its length, squared in the metric of the cost.
+    That is the real-time iteration. A step that leads much further than the last one,
+    and is not slight beside the cost, answers a jump of the reference or of the state.
+    On plants that bend much, the plans of one program a step are not consistent;
+    iterating each of them is slower and, on swing-ups, no better.
 
-    Then one program is enough, as in the real-time iteration. A step that leads much
-    further than the last one, and is not slight beside the cost, answers a jump of the
-    reference or of the state. On plants that bend much, the plans of one program a step
-    are not consistent; iterating each of them is slower and, on swing-ups, no better.
+    Returns:
+        Whether it does, and the length of the step, squared in the metric of the cost.
     """
     cost, squared_length = _measure_step.unchecked(
         local, request.references, row_prices, proposed
@@ -219,9 +220,10 @@ class Globalization:
         self._request = request
         self._tolerance = tolerance
         self._cost_floor = smallest_cost(prediction, request)
-        self._terms = PriceTerms(request.references, row_prices, 0.0)
+        self._merit_terms = MeritTerms(request.references, row_prices, 0.0)
         weight = prediction.costs.quadratic.terminal
-        self._defect_prices = np.zeros(weight[:, 0].size)
+        blocks, n, _ = weight.shape
+        self._defect_prices = np.zeros(blocks * n)
         self._curvature = CurvatureUpdates()
         self._progress = Progress()
         self.squared_lengths: list[float] = []
@@ -251,7 +253,7 @@ class Globalization:
         multipliers = _multipliers_by_stage(solution, local)
         self._raise_hard_price(multipliers)
         forecast = _forecast_step.unchecked(
-            local, self._terms, self._defect_prices, proposed, multipliers
+            local, self._merit_terms, self._defect_prices, proposed, multipliers
         )
         self._defect_prices = forecast.defect_prices
         self.squared_lengths.append(forecast.squared_length)
@@ -271,8 +273,8 @@ class Globalization:
         """Raises the price of hard rows above their multipliers (H, r)."""
         if multipliers.size:
             largest = float(np.abs(multipliers).max())
-            hard_price = max(self._terms.hard_price, 2.0 * largest)
-            self._terms = self._terms._replace(hard_price=hard_price)
+            hard_price = max(self._merit_terms.hard_price, 2.0 * largest)
+            self._merit_terms = self._merit_terms._replace(hard_price=hard_price)
 
     def _search_line(
         self,
@@ -304,7 +306,7 @@ class Globalization:
                 # bounds stay those of the program
                 rows = local.rows._replace(E=candidate.rows.E)
                 judged = candidate._replace(rows=rows)
-            merit = _merit.unchecked(judged, self._terms, self._defect_prices)
+            merit = _merit.unchecked(judged, self._merit_terms, self._defect_prices)
             if merit <= largest_merit:
                 return candidate
         return None
@@ -494,7 +496,7 @@ def _priced_cost(cost, terms, rows, plan):
 @compiled
 def _measure_step(local, references, prices, proposed):
     """Returns the cost of a plan, violations included, and a step's squared length."""
-    terms = PriceTerms(references, prices, 0.0)
+    terms = MeritTerms(references, prices, 0.0)
     cost = _priced_cost(local.cost, terms, local.rows, local.plan)
     squared_length = _cost_of_step(local.cost, references, local.plan, proposed)
     return cost, squared_length

@@ -49,7 +49,7 @@ _ROOM = (
 )
 _FLIGHTS_IMPROVED = 3  # of a search, the cheapest ones
 _ALIKE = 0.05  # share of the range of a plan's inputs by which the same plan may differ
-_KEPT = 1e-3  # share of its cost by which a new plan may be dearer than the last one
+_DEARER = 1e-3  # share of its cost by which a new plan may be dearer than the last one
 
 
 class _Situation(NamedTuple):
@@ -225,13 +225,13 @@ class _FlightSearch:
         if not self._flights:
             return None
         flights = sorted(self._flights, key=cmp_to_key(_order))
-        best = foresight.hold(flights[0], question)
+        best = foresight.prolong(flights[0], question)
         for flight in flights[:_FLIGHTS_IMPROVED]:
             if not flight.arrives or perf_counter() > self._deadline:
                 break
             candidate = best
             if flight is not flights[0]:
-                candidate = foresight.hold(flight, question)
+                candidate = foresight.prolong(flight, question)
             improved = foresight.improve(candidate, question)
             if improved.is_better_than(best):
                 best = improved
@@ -638,7 +638,7 @@ class ManyStarts:
             if self._has_tubes:
                 return decision  # which the last plan, moved on, may have left
             cost = self._plan_cost(decision.means, decision.inputs, question)
-            limit = cost / (1.0 + _KEPT)
+            limit = cost / (1.0 + _DEARER)
         if self._plan_cost(means, inputs, question) >= limit:
             return decision
         gains = self.controller.gains(previous, situation.parameters)

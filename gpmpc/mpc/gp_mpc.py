@@ -30,7 +30,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -467,15 +467,6 @@ class NonlinearGPMPC(GPMPC):
         )
 
 
-class _Ending(NamedTuple):
-    """How an iteration ends, unless a broken promise is worth one more program."""
-
-    local: LocalProblem  # with the last plan
-    status: Status
-    # whether the plan misses curved bounds by more than its program promised
-    breaks_promise: bool
-
-
 class _ControlStep:
     """One decision's programs, from a first guess to a plan that is good enough."""
 
@@ -525,12 +516,20 @@ class _ControlStep:
             if iterate.status is None and self._may_go_on:
                 local = iterate.local
                 continue
-            ending = self._end(iterate, local, program, solution)
-            if ending.breaks_promise and self._may_go_on:
-                # A curved bound lies elsewhere than the program saw it.
-                local = self._prediction.linearize(ending.local.plan, self._request)
-                continue
-            return self._conclude(ending.local, guess, solution, ending.status)
+            last_problem = self._end(iterate, local, program)
+            status = iterate.status
+            if self._breaks_promise(status, last_problem, solution):
+                if self._may_go_on:
+                    # A curved bound lies elsewhere than the program saw it.
+                    plan = last_problem.plan
+                    local = self._prediction.linearize(plan, self._request)
+                    continue
+                # Who asked for a single program takes the plan as it is.
+                if self._most_programs > 1:
+                    status = None
+            if status is None:
+                status = self._limit
+            return self._conclude(last_problem, guess, solution, status)
 
     @property
     def _may_go_on(self) -> bool:
@@ -755,30 +754,18 @@ class _ControlStep:
         return local._replace(plan=Plan(states, inputs, local.covariances))
 
     def _end(
-        self,
-        iterate: Iterate,
-        local: LocalProblem,
-        program: CondensedProgram,
-        solution: QPSolution,
-    ) -> _Ending:
-        """Returns how the iteration ends with the plan that a step led to.
+        self, iterate: Iterate, local: LocalProblem, program: CondensedProgram
+    ) -> LocalProblem:
+        """Returns the problem of the plan that a step led to, rolled out where needed.
 
         Args:
             iterate: What the step led to.
             local: The problem that the step started from.
             program: Of that problem.
-            solution: Of the program.
         """
-        ending = iterate.local
         if iterate.leaves_defects or self._prediction.rolls_out:
-            ending = self._close_defects(ending, local, program)
-        status = iterate.status
-        breaks_promise = self._breaks_promise(status, ending, solution)
-        # Who asked for a single program takes the plan as it is.
-        is_stopped_early = breaks_promise and self._most_programs > 1
-        if status is None or is_stopped_early:
-            status = self._limit
-        return _Ending(ending, status, breaks_promise)
+            return self._close_defects(iterate.local, local, program)
+        return iterate.local
 
     def _close_defects(
         self, ending: LocalProblem, local: LocalProblem, program: CondensedProgram

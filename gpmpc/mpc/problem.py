@@ -394,12 +394,12 @@ class Problem:
         further = states - n
         cost = self.cost
         weight = ((0, further), (0, further))
-        by_stage = ((0, 0),) * (cost.Q.ndim - 2)
+        stage_axis = ((0, 0),) * (cost.Q.ndim - 2)
         return replace(
             self,
             cost=replace(
                 cost,
-                Q=np.pad(cost.Q, (*by_stage, *weight)),
+                Q=np.pad(cost.Q, (*stage_axis, *weight)),
                 terminal=np.pad(cost.terminal, weight),
             ),
             constraints=[part.over(n, states) for part in self.constraints],

@@ -16,7 +16,7 @@ from gpmpc.mpc._linear_quadratic import (
 )
 from gpmpc.mpc._linearization import LocalProblem
 from gpmpc.mpc._sqp import (
-    PriceTerms,
+    MeritTerms,
     _between,
     _cost_of_small_input,
     _costates,
@@ -93,7 +93,7 @@ class Case:
 
     @property
     def terms(self):
-        return PriceTerms(self.references, self.prices, self.hard_price)
+        return MeritTerms(self.references, self.prices, self.hard_price)
 
     def cost_of(self, plan):
         return evaluate_cost(self.cost, plan.states, plan.inputs, self.references, 1.0)
