@@ -82,7 +82,11 @@ class DualActiveSet:
     tolerance: float = 1e-9
     iteration_limit: int | None = None
     time_limit: float | None = None
+    #: by shape of G: of hard rows, and of those that were priced last
     _workplaces: dict = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+    _priced_workplaces: dict = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
@@ -125,11 +129,10 @@ class DualActiveSet:
         began = perf_counter()
         try:
             shape = problem.G.shape
-            workplace = (
-                self._workplaces[shape]
-                if prices is None
-                else self._workplace(shape, prices)
-            )
+            if prices is None:
+                workplace = self._workplaces[shape]
+            else:
+                workplace = self._priced_workplace(shape, prices)
         except (AttributeError, KeyError, TypeError, ValueError):
             if not isinstance(problem, tuple):
                 got = type(problem).__name__
@@ -175,6 +178,19 @@ class DualActiveSet:
         return Prepared(
             self, QuadraticProgram(P, np.zeros(len(np.atleast_1d(P))), G), prices
         )
+
+    def _priced_workplace(self, shape: tuple, prices: ArrayLike) -> Workplace:
+        """Returns what solves of this shape of G and these prices of rows share.
+
+        The last one serves as long as prices stay, as they do from step to step.
+        """
+        last = self._priced_workplaces.get(shape)
+        if last is not None and np.array_equal(last[0][shape[1] :], prices):
+            return last
+        # Another thread may be at work with the last one: its memory is left alone.
+        workplace = self._workplace(shape, prices)
+        self._priced_workplaces[shape] = workplace
+        return workplace
 
     def _workplace(
         self, shape: tuple, prices: ArrayLike | None, prepared: bool = False

@@ -3,10 +3,10 @@
 *Memory* is one matrix that solves work in, the *workspace* the view of it that compiled
 code has, and a *record* what a solve leaves behind (``gpmpc.qp._record``).
 
-Asking the system for memory costs as much as a small solve, so each shape of a program
-without prices, and each prepared program, keeps its own. Threads may share it, since a
-solve keeps the interpreter's lock. The rows of memory, all padded to the same length,
-are
+Asking the system for memory costs as much as a small solve, so each shape of a program,
+with its last prices, and each prepared program keeps its own. Threads may share it,
+since a solve keeps the interpreter's lock. The rows of memory, all padded to the same
+length, are
 
     settings (1) | vectors (25) | integer vectors (4) | L | factor | rows | K
 

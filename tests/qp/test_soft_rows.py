@@ -175,3 +175,21 @@ def test_a_multiplier_above_its_rows_price_is_a_dual_residual(solve, side, price
         solution.residuals().dual > 0.1
     )  # half the price, whatever it is held against
     assert not solution.is_optimal(0.1)
+
+
+def test_prices_that_change_and_return_leave_nothing_behind(rng):
+    problem = conflicting_problem(rng, 6, 8)
+    other = conflicting_problem(rng, 6, 8)
+    solver = DualActiveSet()
+    low, high = np.full(8, 0.1), np.full(8, 5.0)
+    solutions = [
+        (asked, prices, solver.solve(asked, prices=prices))
+        for prices in (low, low, high, low, None, high)
+        for asked in (problem, other)
+    ]
+    for asked, prices, solution in solutions:
+        alone = DualActiveSet().solve(asked, prices=prices)
+        np.testing.assert_array_equal(solution.x, alone.x)
+        np.testing.assert_array_equal(solution.caps, alone.caps)
+    below, above = solutions[0][2], solutions[4][2]
+    assert np.abs(below.z).max() <= 0.1 < np.abs(above.z).max()
