@@ -20,7 +20,7 @@ from gpmpc.cli._commands import Result
 from gpmpc.cli._folders import find_modules_here, write_files, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.logs import IdentifiedModel, Judgement, Log
-from gpmpc.logs._judging import check_held_out, most_steps
+from gpmpc.logs._judging import check_held_out, check_train, most_steps
 from gpmpc.plotting import judgement_figure, png
 from gpmpc.studies._document import Document, Table, number, terminal
 from gpmpc.studies._run_folder import describe_code
@@ -28,8 +28,8 @@ from gpmpc.studies.study import fingerprint
 
 _MODEL = "model.safetensors"
 _JUDGED_STEPS = (1, 10, 50)  # ahead, besides the longest
-_UNUSABLE = 3  # exit code of a model that is written, and should not be used
-_NOISE = (
+_EXIT_UNUSABLE = 3  # of a model that is written, and should not be used
+_NOISE_IN_WORDS = (
     "the noise of the outputs, which adds up, and that of the sensors, which does not, "
     "as fitted to held-out rollouts"
 )
@@ -50,6 +50,7 @@ def learn(arguments: argparse.Namespace) -> Result:
         console.print(f"  {finding.run}: {finding.kind}: {finding.text}")
     train, held_out = _split(log, arguments.held_out)
     check_held_out(held_out, arguments.steps)
+    check_train(train)
     with writing(folder, "to"):
         folder.mkdir(parents=True, exist_ok=True)
         learned, judgement = _learn_and_judge(
@@ -78,7 +79,7 @@ def learn(arguments: argparse.Namespace) -> Result:
         "losses": judgement.losses,
         "rows": report.data.to_dict("records"),
     }
-    return Result(data, _UNUSABLE if reasons else 0)
+    return Result(data, _EXIT_UNUSABLE if reasons else 0)
 
 
 def _reasons_against(learned: IdentifiedModel, judgement: Judgement) -> tuple[str, ...]:
@@ -128,7 +129,7 @@ def _learn_and_judge(
             memory=memory,
             for_control=arguments.for_control,
         )
-        longest = min(arguments.steps, most_steps(learned, held_out))
+        longest = min(arguments.steps, most_steps(learned, held_out, train))
         show(f"judging on held-out runs, at most {longest} steps ahead")
         steps = {step for step in _JUDGED_STEPS if step <= longest} | {longest}
         judgement = logs.judge(learned, held_out, train, sorted(steps))
@@ -227,7 +228,7 @@ def _report(
         "In brackets under a mean error stands the root mean square. A width of 1 "
         "claims the spread that the errors have; the interval in brackets is the exact "
         "one of Clopper and Pearson for windows that do not overlap.",
-        f"Intervals hold {_NOISE}.",
+        f"Intervals hold {_NOISE_IN_WORDS}.",
         f"Candidates were compared on held-out rows: {learned.folds}.",
     ]
     lists: dict[str, Sequence[str]] = {}
@@ -397,7 +398,7 @@ def _facts(
         ("rate", f"{1 / train.time_step:g} Hz"),
         ("candidates compared on", learned.folds),
         ("judged on", ", ".join(run.name for run in held_out)),
-        ("intervals hold", _NOISE),
+        ("intervals hold", _NOISE_IN_WORDS),
         ("made", origin["created"]),
         ("made by", describe_code(origin)),
         ("command", origin["command"]),
@@ -436,7 +437,7 @@ def _doubts(learned: IdentifiedModel, judgement: Judgement) -> list[str]:
             "past says may correct them: a controller plans with the movement alone, "
             "from its own estimate."
         )
-    doubts.append("Outside the ranges below nothing was seen.")
+    doubts.append("Outside the ranges of the data (table above) nothing was seen.")
     if getattr(nominal, "feedback", False):
         doubts.append(
             "The term feedback describes the controller that flew: it predicts such "

@@ -3,7 +3,8 @@
 How ``read_log`` makes rows of files, and where each step is:
 
 1. file          ``_formats`` finds the reader by the file's ending; one file a format.
-                 To add a format, see there. It returns tables by topic (``_file``).
+                 To add a format, see there. It returns tables by topic (``_file``),
+                 which ``_runs`` splits into runs.
 2. channels      ``_signals`` reads the columns that the mapping names (``_mapping``),
                  in SI units (``_units``), without what nobody measured (``_dropouts``).
 3. clock         ``_clocks`` orders the stamps; ``_resampling`` makes one grid for all
@@ -22,7 +23,7 @@ How ``learn`` makes a model of a log:
 1. structures    ``_structures`` has the simplest models, and what they may grow by. To
                  add a structure, see there. The models themselves are those of
                  ``gpmpc.models``.
-2. folds         ``_folds`` deals runs, or blocks of rows, to two folds.
+2. folds         ``_folds`` deals runs, or blocks of rows, to two or four folds.
 3. rows          ``_smoothing`` takes the noise from the rows that models are fitted to.
 4. parameters    ``_fitting`` fits nominal models on rollouts.
 5. residuals     ``_output_gps`` trains GPs on what a nominal model leaves.

@@ -56,6 +56,10 @@ def sentinels(values: Array) -> np.ndarray:
 def zero_dropouts(states: Array) -> np.ndarray:
     """Finds stretches in which all states are exactly zero, with a jump at an end.
 
+    A simulation begins at zeros as well, and leaves them with the largest change that
+    it has. So zeros in the first row are no measurement only where what ends them is a
+    jump beside all other changes.
+
     Args:
         states: Columns that are logged together (K, n), two or more.
 
@@ -67,12 +71,16 @@ def zero_dropouts(states: Array) -> np.ndarray:
         return np.zeros(len(states), dtype=bool)
     changes = np.abs(np.diff(states, axis=0))
     between = zero[1:] | zero[:-1]
-    usual = _usual_change(changes[~between])
+    measured_changes = changes[~between]
+    usual = _usual_change(measured_changes)
+    largest = np.nanmax(measured_changes, axis=0, initial=0.0)
     jumps = np.any(changes > JUMP_CHANGES * usual, axis=1)
+    jumps_from_start = np.any(changes > JUMP_CHANGES * largest, axis=1)
     dropouts = np.zeros(len(states), dtype=bool)
     for begin, end in _stretches(zero):
         jumps_in = begin > 0 and jumps[begin - 1]
-        jumps_out = end < len(states) and jumps[end - 1]
+        out = jumps if begin > 0 else jumps_from_start
+        jumps_out = end < len(states) and out[end - 1]
         dropouts[begin:end] = jumps_in or jumps_out
     return dropouts
 

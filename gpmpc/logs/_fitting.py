@@ -35,7 +35,9 @@ _EVALUATIONS = 15
 _COUNTED_STEPS = 8  # steps of a rollout whose errors count
 _BATCH = 40_000  # states of one batch of rollouts: parameter vectors times windows
 _BLOCK = 4  # consecutive windows whose errors are correlated
-_FIRST_TIME_CONSTANT = 0.03  # [s] of a first-order lag, at which the search begins
+# [time steps] of a first-order lag, at which the search begins. From a longer one the
+# search may jump over a lag of few steps to below zero, where nothing pulls it back.
+_FIRST_TIME_CONSTANT = 1.0
 _DIVERGED = 1e6  # residual of a rollout that is not finite
 
 
@@ -71,8 +73,8 @@ def fit_nominal(
             logarithm, count.
 
     Raises:
-        SettingError: An argument is of another kind or out of range, or theta0 lies
-            outside of the parameters' bounds.
+        SettingError: An argument is of another kind or out of range, theta0 lies
+            outside of the parameters' bounds, or two of these are equal.
         ShapeError: theta0 has another length.
         DataError: No piece of the log is long enough, or the rollouts at theta0 are not
             finite.
@@ -89,7 +91,8 @@ def fit_nominal(
         raise ShapeError(f"theta0 must have {count} entries; got {theta0.shape}")
     windows = log.windows(steps, past=max(model.past, PAST), most=_WINDOWS)
     lags = len(model.time_constants)
-    theta0 = np.concatenate([theta0, np.full(lags, _FIRST_TIME_CONSTANT)])
+    first_time_constants = np.full(lags, _FIRST_TIME_CONSTANT * log.time_step)
+    theta0 = np.concatenate([theta0, first_time_constants])
     bounds = _bounds(model, lags)
     if not ((bounds[0] <= theta0) & (theta0 <= bounds[1])).all():
         rule = "must lie between the parameters' bounds"
@@ -135,6 +138,9 @@ def _bounds(model: LogModel, lags: int) -> tuple[Array, Array]:
     count = len(model.nominal.parameter_names)
     infinite = np.full(count, np.inf)
     low, high = getattr(model.nominal, "bounds", (-infinite, infinite))
+    if not (np.asarray(low) < np.asarray(high)).all():
+        rule = "must have a low below its high for every parameter"
+        raise SettingError("bounds", f"{rule}; got {low} and {high}")
     endless = np.full(lags, np.inf)
     return np.concatenate([low, -endless]), np.concatenate([high, endless])
 

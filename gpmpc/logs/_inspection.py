@@ -26,10 +26,10 @@ from gpmpc.logs._channel_figures import (
     text_warning,
 )
 from gpmpc.logs._columns import (
+    TablesOfRun,
     check_column,
     column_number,
     named_columns,
-    runs_side_by_side,
 )
 from gpmpc.logs._delays import Delay, delay_table, find_delays
 from gpmpc.logs._file import STAMP, Tables
@@ -39,6 +39,7 @@ from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._read_log import read_log
 from gpmpc.logs._row_times import row_times
+from gpmpc.logs._runs import split_into_runs
 
 # columns that hold the time where nobody says which
 TIMES = (STAMP, "timestamp", "t", "time", "stamp", "Time", "seconds")
@@ -85,7 +86,7 @@ class Inspection:
 class _Source(NamedTuple):
     """The table of a stream."""
 
-    title: str  # a topic, or one of the runs that stand side by side in a file
+    title: str  # a topic, or one of the runs in a file
     topic: str
     table: pd.DataFrame
 
@@ -266,13 +267,22 @@ def _check_times(
 def _sources(
     path: str | Path, tables: Tables, mapping: LogMapping | None
 ) -> list[_Source]:
-    """Lists the tables of the streams: one for each topic, or each run side by side."""
+    """Lists the tables of the streams: one for each topic, or for each run.
+
+    A table whose runs cannot be told apart is a single stream; reading it says why.
+    """
     if mapping is None:
         return [_Source(topic, topic, table) for topic, table in tables.items()]
     named = named_columns(path, tables, mapping)
+    try:
+        runs = list(split_into_runs(Path(path), named, mapping, findings=[]))
+    except DataError:
+        if not mapping.run:
+            raise
+        runs = [TablesOfRun("", named)]
     return [
         _Source(topic or run, topic, table)
-        for run, tables_of_run in runs_side_by_side(Path(path), named, mapping)
+        for run, tables_of_run in runs
         for topic, table in tables_of_run.items()
     ]
 

@@ -129,7 +129,8 @@ def judge(
     Raises:
         SettingError: An argument is of another kind, or there is no step, or steps do
             not increase.
-        DataError: No piece of the held-out log is long enough.
+        DataError: No piece of the held-out log is long enough, or none of the train
+            log, to which baselines are fitted as many steps ahead.
 
     See Also:
         ``learn``; ``Judgement``, its result.
@@ -141,7 +142,7 @@ def judge(
     model = learned.model
     space = held_out.space
     windows = held_out.windows(max(steps), max(model.past, PAST), most=_WINDOWS)
-    model_errors = windows.errors(model.rollout(windows), steps)
+    model_errors = model.rollout_errors(windows, steps)
     errors = {MODEL: model_errors}
     errors |= baseline_errors(model.kinematics, train, windows, steps)
     distances = {name: space.distances(e) for name, e in errors.items()}
@@ -183,13 +184,32 @@ def check_held_out(held_out: Log, steps: int) -> None:
         )
 
 
-def most_steps(learned: IdentifiedModel, held_out: Log) -> int:
-    """Returns how many steps ahead a model can be judged on a log, one at least.
+def check_train(train: Log) -> None:
+    """Raises ``DataError`` of a log to which no baseline can be fitted.
 
-    A model that looks back on many rows leaves fewer of them ahead.
+    Args:
+        train: Runs that are to be learned from.
+    """
+    needed = PAST + 2
+    longest = train.longest_piece
+    if longest < needed:
+        raise DataError(
+            f"learning needs {needed} rows without a gap; the longest piece to learn "
+            f"from has {longest}: log longer runs, or allow longer gaps (max_gap)"
+        )
+
+
+def most_steps(learned: IdentifiedModel, held_out: Log, train: Log) -> int:
+    """Returns how many steps ahead a model can be judged, one at least.
+
+    A model that looks back on many rows leaves fewer of the held-out ones ahead. The
+    baselines beside it are fitted to as many steps of the rows that it was learned
+    from.
     """
     past = max(learned.model.past, PAST)
-    return max(held_out.longest_piece - past - 1, 1)
+    judged = held_out.longest_piece - past - 1
+    fitted = train.longest_piece - PAST - 1
+    return max(min(judged, fitted), 1)
 
 
 def _check_steps(steps: Sequence[int]) -> None:

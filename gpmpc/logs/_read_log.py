@@ -1,6 +1,6 @@
 """Reads log files as a ``Log``: files to tables, to runs, to usable rows."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -10,21 +10,20 @@ import numpy as np
 from gpmpc._bounds import MemoryBudget
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import DataError, check_kind
-from gpmpc.logs._columns import check_column, named_columns, runs_side_by_side
+from gpmpc.logs._columns import named_columns
 from gpmpc.logs._conventions import read_rigid_bodies
-from gpmpc.logs._file import Tables, run_name
+from gpmpc.logs._file import run_name
 from gpmpc.logs._findings import Finding, RunFindings
 from gpmpc.logs._formats import read_file
 from gpmpc.logs._frames import with_axes_of_files
 from gpmpc.logs._log import Log, LogRun
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._run_tables import RunTable, tabulate
+from gpmpc.logs._runs import split_into_runs
 from gpmpc.logs._usable_rows import select_rows, usual_spread
 
 SHORTEST_STEP = 1e-5  # [s] of rows that are measured one by one
 LONGEST_STEP = 3600.0  # [s] likewise
-MOST_RUNS = 100  # in a file, unless each has
-FEWEST_ROWS = 10
 
 
 @explains_arguments
@@ -113,7 +112,8 @@ def _read_run_tables(
         findings.extend(file.findings)
         budget = MemoryBudget(path)  # of the rows; the reader had one of its own
         named = named_columns(path, file.tables, mapping)
-        for run, tables_of_run in _split_into_runs(path, named, mapping, findings):
+        for label, tables_of_run in split_into_runs(path, named, mapping, findings):
+            run = f"{run_name(path)}:{label}" if label else run_name(path)
             if run in tables:
                 raise DataError(
                     f"run {run!r} comes from two files: give the files different names"
@@ -125,40 +125,6 @@ def _read_run_tables(
     if not tables:
         raise DataError("no log file was given")
     return list(tables.values())
-
-
-def _split_into_runs(
-    path: Path, tables: Tables, mapping: LogMapping, findings: list[Finding]
-) -> Iterator[tuple[str, Tables]]:
-    """Yields the runs of a file with their names: one, or those of the mapping.
-
-    Rows that name no run are left out, with a finding.
-    """
-    if not mapping.run:
-        for run, tables_of_run in runs_side_by_side(path, tables, mapping):
-            yield f"{run_name(path)}:{run}" if run else run_name(path), tables_of_run
-        return
-    if "" not in tables:
-        raise DataError(
-            f"{path}: has topics, and is one run; run: {mapping.run} needs a file with "
-            "a single table"
-        )
-    table = tables[""]
-    check_column(str(path), table, mapping.run)
-    names = table[mapping.run].replace(r"^\s*$", np.nan, regex=True)
-    nameless = int(names.isna().sum())
-    if nameless == len(names):
-        raise DataError(f"{path}: column {mapping.run!r} names no run in any row")
-    text = f"{nameless} rows left out: their {mapping.run} is empty"
-    RunFindings(run_name(path), findings).add("no run", nameless, text)
-    count = names.nunique()
-    if count > MOST_RUNS and count > len(table) / FEWEST_ROWS:
-        raise DataError(
-            f"{path}: column {mapping.run!r} names {count} runs in {len(table)} rows; "
-            f"a run has {FEWEST_ROWS} at least"
-        )
-    for run, rows in table.groupby(names, sort=False):
-        yield f"{run_name(path)}:{run}", {"": rows}
 
 
 def _time_step(
@@ -184,16 +150,24 @@ def _time_step(
 
 
 def _check_content(
-    runs: Sequence[LogRun], paths: Sequence[Path], findings: Sequence[Finding]
+    runs: Sequence[LogRun], paths: Sequence[Path], findings: list[Finding]
 ) -> None:
-    """Raises ``DataError`` where nothing can be learned from the usable rows."""
+    """Raises ``DataError`` where nothing can be learned from the usable rows.
+
+    Inputs may stay within a run, as in step tests. Where they never change, a finding
+    says so: the states of a free decay move all the same.
+    """
     if not runs:
         others = " and others" if len(paths) > 1 else ""
         reasons = "; ".join(f"{f.run}: {f.text}" for f in findings[-3:])
         raise DataError(f"{paths[0]}{others}: no row can be used ({reasons})")
-    has_inputs = runs[0].inputs.shape[1] > 0
-    if has_inputs and all(np.ptp(run.inputs, axis=0).max() == 0 for run in runs):
+    inputs = np.concatenate([run.inputs for run in runs])
+    if not inputs.shape[1] or np.ptp(inputs, axis=0).max() > 0:
+        return
+    if not any(np.ptp(run.states, axis=0).max() > 0 for run in runs):
         raise DataError(
-            "no input changes in any row: the system is at rest, and nothing can be "
-            "learned of it"
+            "no input changes in any row, nor does a state: the system is at rest, and "
+            "nothing can be learned of it"
         )
+    text = "no input changes in any row: what inputs do cannot be learned"
+    findings.append(Finding("constant inputs", runs[0].name, len(inputs), text))

@@ -15,6 +15,11 @@ def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | N
 
     Its step is ``time.step``, or that of its ``rate`` where a table has no stamps.
 
+    Args:
+        where: Names the table, for errors.
+        table: Whose index says at which place of the file each row stands.
+        mapping: Says the step.
+
     Raises:
         DataError: The column that ``time.step`` names does not hold one positive
             number.
@@ -23,10 +28,26 @@ def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | N
     if isinstance(step, str):
         step = _only_number(where, table, step)
     if step is not None:
-        return np.arange(len(table), dtype=float) * step * TIME_UNITS[mapping.time_unit]
+        return _steps_from_first(table) * step * TIME_UNITS[mapping.time_unit]
     if mapping.rate and STAMP not in table and "timestamp" not in table:
-        return np.arange(len(table), dtype=float) / mapping.rate
+        return _steps_from_first(table) / mapping.rate
     return None
+
+
+def _steps_from_first(table: pd.DataFrame) -> Array:
+    """Counts the steps (K,) from the first row of a run to each of its rows.
+
+    Rows of others that stand between those of the run in the file took time as well.
+    Where rows of several runs take turns, each takes one step from one of its rows to
+    the next.
+    """
+    places = table.index.to_numpy(dtype=float)
+    distances = np.diff(places)
+    if not len(distances):
+        return np.zeros(len(places))
+    usual = np.quantile(distances, 0.5, method="lower")
+    steps = np.maximum(distances / usual, 1.0)
+    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def _only_number(where: str, table: pd.DataFrame, column: str) -> float:

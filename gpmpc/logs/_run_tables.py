@@ -188,7 +188,8 @@ def _signal_on_grid(
     """Resamples a signal to the rows of a grid (G, c), if there is need."""
     if mapping.rate is None and not any(signal.delays):
         return samples.values  # the rows of the grid are those of the table
-    usual_step = float(np.median(np.diff(samples.time)))
+    steps = np.diff(samples.time)
+    usual_step = float(np.median(steps)) if len(steps) else 0.0
     if mapping.rate is not None:
         usual_step = max(usual_step, 1 / mapping.rate)
     interpolation = Interpolation(

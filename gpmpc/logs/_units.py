@@ -60,7 +60,7 @@ SYMBOLS = {
     "g": Conversion("m/s2", 9.80665),  # standard gravity, not the gram
 }
 _NO_UNIT = ("", "1", "-")
-_FACTOR = re.compile(r"([A-Za-z%]+)\^?(-?\d?)")
+_FACTOR = re.compile(r"([A-Za-z%]+)\^?((?:-?\d)?)")
 
 
 def conversion(key: str, unit: str) -> Conversion:

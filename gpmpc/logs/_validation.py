@@ -25,7 +25,9 @@ from gpmpc.models._log_model import LogModel
 _CORRECTED_WINDOWS = 2400  # that a correction is fitted to
 #: of models of all rows, by those of three quarters and of halves
 _GAIN_EXPONENT = np.log(4 / 3) / np.log(3 / 2)
-_LARGEST = 1e6  # state of a rollout that a correction is fitted to
+#: ranges of a state in the log, by which a rollout that a correction is fitted to may
+#: leave it
+_LARGEST_DEPARTURE = 1e6
 
 
 class _Validation(NamedTuple):
@@ -68,6 +70,14 @@ class Validations:
         self._judged_steps = judged_steps
         self._validations: dict[str, list[_Validation]] = {}
         self._models: dict[str, list[LogModel]] = {}  # of the folds, corrected
+        states = np.concatenate([run.states for run in log])
+        low = states.min(axis=0)
+        high = states.max(axis=0)
+        self._middle = (low + high) / 2  # of each state (n,)
+        magnitude = np.maximum(np.abs(low), np.abs(high))
+        # Of a state that never moves, its size; of zeros, one.
+        size = np.where(magnitude > 0, magnitude, 1.0)
+        self._range = np.where(high > low, high - low, size)  # (n,)
 
     def choose_averages(self, structure: Structure) -> Averages | None:
         """Chooses the best average of corrections of a structure.
@@ -115,6 +125,7 @@ class Validations:
             return noise
         of_halves = self.models(structure)
         gains = learning_gains(
+            # Two quarters of each fold, in its order (``_quarters``).
             fewer=[of_halves[i // 2] for i in range(len(validations))],
             models=models,
             logs=held_out,
@@ -161,6 +172,8 @@ class Validations:
     def _quarters(self) -> list[Fold]:
         """Halves what each fold holds out, every other run or block of it.
 
+        Two quarters of the first fold, then two of the second.
+
         Raises:
             DataError: One would be without windows.
         """
@@ -168,10 +181,12 @@ class Validations:
         for fold in self._folds:
             runs = fold.held_out.runs
             for first in range(2):
-                others = (*fold.train.runs, *runs[1 - first :: 2])
+                held_out_runs = runs[first::2]
+                other_half = runs[1 - first :: 2]
+                train_runs = (*fold.train.runs, *other_half)
                 quarter = Fold(
-                    train=replace(fold.train, runs=others),
-                    held_out=replace(fold.held_out, runs=runs[first::2]),
+                    train=replace(fold.train, runs=train_runs),
+                    held_out=replace(fold.held_out, runs=held_out_runs),
                 )
                 quarter.held_out.windows(self._steps, past=self._past, most=1)
                 quarters.append(quarter)
@@ -187,8 +202,9 @@ class Validations:
         )
         with np.errstate(over="ignore", invalid="ignore"):
             predicted = model.rollout(windows)
-        is_finite = np.abs(predicted).max(axis=(1, 2)) < _LARGEST
-        return Rollouts(windows, predicted)[is_finite]
+            departures = np.abs(predicted - self._middle) / self._range
+        stays_near = departures.max(axis=(1, 2)) < _LARGEST_DEPARTURE
+        return Rollouts(windows, predicted)[stays_near]
 
     def _correct(
         self, model: LogModel, structure: Structure, rollouts: Sequence[Rollouts]

@@ -77,6 +77,19 @@ def test_a_column_that_holds_nothing_but_sentinels_is_missing():
     assert sentinels(np.full(100, 1e30)).all()
 
 
+@pytest.mark.parametrize("before", [1, 60])
+def test_a_simulation_that_begins_at_zero_keeps_its_start(tmp_path, before):
+    t = 0.01 * np.maximum(np.arange(400) - (before - 1), 0)  # from the step on
+    states = {"angle": 1 - np.exp(-t / 0.3), "rate": 1 - np.exp(-t / 0.02)}
+    table = swing(400).assign(**states)
+    log = read(tmp_path, table)
+    assert "all zero" not in findings(log)
+    assert (log.runs[0].states[0] == 0).all()
+    silent = swing()
+    silent.loc[:29, ["angle", "rate"]] = 0.0
+    assert "30 rows" in findings(read(tmp_path, silent))["all zero"]
+
+
 def test_zeros_for_all_states_are_no_measurement(tmp_path):
     table = swing()
     table.loc[300:319, ["angle", "rate"]] = 0.0

@@ -163,9 +163,27 @@ def test_a_log_that_contradicts_its_mapping_is_inspected(table, tmp_path):
     )
     inspection = inspect_log(tmp_path / "log.csv", mapping)
     assert inspection.follows == {}
-    assert any(
-        "cannot be learned from: no input" in text for text in inspection.warnings
-    )
+    assert any("no input changes" in text for text in inspection.warnings)
+    table.assign(u=0.0, a=0.0).to_csv(tmp_path / "log.csv", index=False)
+    inspection = inspect_log(tmp_path / "log.csv", mapping)
+    assert any("cannot be learned from: " in text for text in inspection.warnings)
+
+
+def test_each_run_of_a_column_has_its_own_clock(tmp_path):
+    t = 0.1 * np.arange(100)
+    table = pandas.DataFrame({"t": [*t, *t], "x": np.sin([*t, *(t + 1)]), "u": 0.0})
+    table["flight"] = np.repeat([7, 8], 100)
+    table.to_csv(tmp_path / "log.csv", index=False)
+    mapping = {"time": "t", "states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
+    by_run = LogMapping.from_dict({**mapping, "run": "flight"})
+    streams = inspect_log(tmp_path / "log.csv", by_run).streams.set_index("stream")
+    assert list(streams.index) == ["7", "8"]
+    assert not streams[["repeated stamps", "backward stamps", "gaps"]].any(axis=None)
+    # Where no row names a run, the page is made, and says so.
+    table.assign(flight="").to_csv(tmp_path / "log.csv", index=False)
+    inspection = inspect_log(tmp_path / "log.csv", by_run)
+    assert any("names no run in any row" in text for text in inspection.warnings)
+    assert inspection.streams["repeated stamps"].sum() == 100
 
 
 def test_learn_writes_its_three_files_and_names_mistakes(tmp_path):

@@ -22,6 +22,7 @@ from gpmpc.logs import (
     read_log,
     save_learned,
 )
+from gpmpc.logs._judging import most_steps
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._noise import _scales, error_variances, follow_errors
 from gpmpc.logs._output_gps import choose_rows, train_output_gp
@@ -234,6 +235,15 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
     wrong = replace(
         learned, model=replace(learned.model, theta=-learned.model.theta, gps=())
     )
+    # One that gives no numbers is no exception.
+    nothing = replace(wrong.model, theta=np.full_like(wrong.model.theta, np.nan))
+    judgement = judge(replace(wrong, model=nothing), held_out, train, steps=(1, 10))
+    assert any("constant velocity" in loss for loss in judgement.losses)
+    # Of short pieces the baselines are fitted to fewer steps.
+    short = [replace(run, begins=tuple(range(0, 500, 70))) for run in train]
+    train = replace(train, runs=tuple(short))
+    assert most_steps(learned, held_out, train) == 49
+    assert judge(learned, held_out, train, steps=(1, 49)).windows
     losses = judge(wrong, held_out, train, steps=(1, 10)).losses
     assert any(
         "rate 10 steps ahead" in loss and "constant state" in loss for loss in losses

@@ -1,6 +1,7 @@
 """Logs come out as they were measured: faults are named, and no gap is bridged."""
 
 import struct
+from pathlib import Path
 
 import numpy as np
 import pandas
@@ -9,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from gpmpc._angles import wrap
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.logs import read_log
+from gpmpc.logs import LogMapping, read_log
+from gpmpc.logs._runs import split_into_runs
 from gpmpc.models._quaternions import rotate, rotation_quaternion
 from gpmpc.models._state_space import StateGroup, StateSpace
 
@@ -186,6 +188,41 @@ def test_runs_are_told_apart_by_file_or_by_column(tmp_path):
     nameless = written(tmp_path, both.assign(flight=" "))
     with pytest.raises(DataError, match="column 'flight' names no run in any row"):
         read_log(nameless, {**PENDULUM, "run": "flight"})
+
+
+def test_a_number_and_its_text_name_the_same_run():
+    table = pandas.DataFrame({"k": [1, 1, "1", 2]})  # such as a file read in parts
+    mapping = LogMapping.from_dict({**PENDULUM, "run": "k"})
+    runs = split_into_runs(Path("a.csv"), {"": table}, mapping, findings=[])
+    assert [(run, len(tables[""])) for run, tables in runs] == [("1", 3), ("2", 1)]
+
+
+@pytest.mark.parametrize("unit", ["m-", "m/s-", "m^-"])
+def test_a_unit_with_a_loose_sign_is_a_mistake_of_the_mapping(unit):
+    states = {"angle": {"columns": ["angle"], "unit": unit}}
+    with pytest.raises(SettingError, match="is an unknown unit"):
+        LogMapping.from_dict({**PENDULUM, "states": states})
+
+
+def test_step_tests_and_decays_are_logs(tmp_path):
+    """Inputs stay within each run, and the states move all the same."""
+    t = 0.1 * np.arange(100)
+    mapping = {
+        "time": "t",
+        "rest": "use",
+        "states": {"x": ["x"]},
+        "inputs": {"u": ["u"]},
+    }
+    files = []
+    for u in (1.0, 2.0, 3.0):
+        table = pandas.DataFrame({"t": t, "x": u * (1 - np.exp(-t / 2)), "u": u})
+        files.append(written(tmp_path, table, f"step{u:g}.csv"))
+    assert not read_log(files, mapping).findings
+    log = read_log(files[0], mapping)
+    assert [one.kind for one in log.findings] == ["constant inputs"]
+    still = written(tmp_path, table.assign(x=1.0), "still.csv")
+    with pytest.raises(DataError, match="the system is at rest"):
+        read_log(still, mapping)
 
 
 def test_findings_stay_with_the_rows_that_they_are_of(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import train
-from gpmpc.logs import Log, LogMapping, judge, learn
+from gpmpc.logs import Log, LogMapping, fit_nominal, judge, learn
 from gpmpc.logs._comparison import compare
 from gpmpc.logs._control_fitness import judge_for_control
 from gpmpc.logs._folds import split_folds
@@ -317,6 +317,57 @@ def test_intervals_of_a_comparison_hold():
     np.testing.assert_array_equal(one.low, again.low)
 
 
+def test_a_window_that_diverges_spoils_no_comparison():
+    rng = np.random.default_rng(0)
+    distances = rng.exponential(1.0, (400, 1, 1))
+    others = rng.exponential(2.0, (400, 1, 1))
+    expected = compare("other", distances[1:], others[1:], block=5, seed=0)
+    distances[0] = 1e20  # once, whose draws are few
+    once = compare("other", distances, others, block=5, seed=0)
+    assert abs(once.low - expected.low) < 0.1
+    for wrong in (np.inf, np.nan):
+        distances[0] = wrong
+        one = compare("other", distances, others, block=5, seed=0)
+        assert np.isfinite([one.low, one.high, one.ratio]).all()
+        assert one.low < 1 < one.ratio
+        both = compare("other", distances, distances, block=5, seed=0)
+        np.testing.assert_array_equal([both.low, both.high], 1.0)
+
+
+@pytest.mark.parametrize("step", [10.0, 0.01])
+def test_a_lag_is_found_whatever_the_time_step(step):
+    """Of two steps, which a search from three of them jumps over."""
+
+    class Follower:
+        parameter_names = ("decay", "gain")
+        start = np.array([-0.02, 0.05]) / step
+
+        def outputs(self, theta, states, inputs, context):
+            decay, gain = theta
+            rate = decay * states[..., 0] + gain * inputs[..., 0]
+            return rate[..., None]
+
+    inputs = held_inputs(np.random.default_rng(0), 300, 1.0, hold=5)
+    kept = np.exp(-1 / 2)
+
+    def rates(x, u):
+        lagged = kept * x[1] + (1 - kept) * u[0]
+        return [(-0.05 * x[0] + 0.1 * lagged) / step, (lagged - x[1]) / step]
+
+    states = simulate(rates, [0, 0], inputs, step)[:, :1]
+    mapping = LogMapping.from_dict({"states": {"c": ["c"]}, "inputs": {"u": ["u"]}})
+    log = log_of([states], [inputs], mapping, step)
+    model = LogModel(
+        kinematics=Increments(log.space),
+        nominal=Follower(),
+        theta=np.empty(0),
+        history=(0,),
+        time_constants=np.zeros(1),
+    )
+    fit = fit_nominal(model, None, log, steps=20)
+    assert 1.0 < fit.model.time_constants[0] / step < 2.5
+
+
 def test_a_model_that_no_controller_should_use_is_named():
     rng = np.random.default_rng(0)
 
@@ -421,6 +472,16 @@ def test_a_runner_up_does_not_stand_for_the_baseline_of_its_name(monkeypatch):
     monkeypatch.setattr("gpmpc.logs._validation._CORRECTED_WINDOWS", 1)
     validations = search._validations._validate(search.best)
     assert all(len(one.rollouts.windows) for one in validations)
+
+
+@pytest.mark.parametrize("scale", [1.0, 2e7])
+def test_states_of_any_unit_are_corrected(scale):
+    """A pressure of 200 bar in Pa is no rollout that diverged."""
+    log = reactor_log(120)
+    runs = tuple(replace(run, states=scale * (2 + run.states)) for run in log)
+    search = tiny_search(replace(log, runs=runs))
+    start = next(one for one in search._structures.values() if one.size == 0)
+    assert search._validations.choose_averages(start) is not None
 
 
 def test_without_inputs_nothing_acts_through_lags():

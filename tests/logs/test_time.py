@@ -5,6 +5,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))
@@ -233,6 +234,29 @@ def test_messages_without_the_stamp_of_the_others_are_counted(tmp_path):
     log = read_log(strange.write_bag(path, topics), BAG_MAPPING)
     assert kinds(log) == {"no stamp": 1}
     assert len(log) == ROWS
+
+
+@pytest.mark.parametrize("time", [{"time": {"step": 0.1}}, {"rate": 10}])
+@pytest.mark.parametrize(
+    ("runs", "pieces"),
+    [
+        (["A"] * 100 + ["B"] * 100 + ["A"] * 100, {"A": [100, 100], "B": [100]}),
+        (["A"] * 100 + [""] * 10 + ["A"] * 190, {"A": [100, 190]}),
+        (["A", "B"] * 150, {"A": [150], "B": [150]}),  # which take turns
+    ],
+)
+def test_rows_that_a_run_lacks_took_time_as_well(tmp_path, time, runs, pieces):
+    phase = 0.1 * np.arange(300)
+    states = np.cumsum(2 + np.sin(phase))
+    table = pandas.DataFrame({"k": runs, "x": states, "u": np.cos(phase)})
+    table.to_csv(tmp_path / "a.csv", index=False)
+    mapping = {"states": {"x": ["x"]}, "inputs": {"u": ["u"]}, "run": "k", **time}
+    log = read_log(tmp_path / "a.csv", mapping)
+    assert log.time_step == pytest.approx(0.1)
+    assert {
+        run.name.removeprefix("a:"): [end - begin for begin, end in run.pieces]
+        for run in log
+    } == pieces
 
 
 def test_a_table_of_one_time_is_refused(tmp_path):
