@@ -1215,6 +1215,9 @@ static int keeps_elastic_rows(const real *misses)
     return 1;
 }
 
+/* Price of a row that does not count: it keeps its place among the others. */
+#define NO_PRICE REAL(1e-9)
+
 /* What elastic rows that cannot be kept may cost. */
 typedef struct {
     real least_price; /* under which no plan outweighs the cost */
@@ -1231,6 +1234,7 @@ static elastic_limits limits_of_price(const gpmpc_problem *problem, const real *
     real cost = smaller(larger(free_cost, last_cost), 2 * free_cost);
     real sum_of_misses = 0;
     real beside = 0;
+    real price;
     int k, e, i;
     for (k = 0; k < H; k++)
         for (e = 0; e < r; e++) {
@@ -1257,7 +1261,10 @@ static elastic_limits limits_of_price(const gpmpc_problem *problem, const real *
             beside += weight / (square * square) * miss * miss;
         }
     cost += beside;
-    limits.least_price = 2 * cost / larger(sum_of_misses, REAL(1e-12));
+    price = larger(2 * cost / larger(sum_of_misses, REAL(1e-12)), NO_PRICE);
+    /* of few digits: a quarter of a power of two */
+    limits.least_price =
+        POW(2, FLOOR(4 * LOG(price) / REAL(0.6931471805599453) + REAL(0.5)) / 4);
     limits.extra_cost = REAL(0.1) * (free_cost + beside);
     return limits;
 }
@@ -1343,7 +1350,7 @@ static void solve_elastic(gpmpc_controller *controller)
         if (row_is_elastic[e])
             highest = larger(highest, problem->prices[e]);
     last_cost = cost_of_plan(problem, &problem->states[0][0], &problem->inputs[0][0]);
-    set_elastic_price(problem, REAL(1e-9)); /* next to nothing: rows keep their place */
+    set_elastic_price(problem, NO_PRICE);
     solve(problem, &controller->program, solution, without);
     if (without->status != GPMPC_SOLVED) {
         set_elastic_price(problem, highest);

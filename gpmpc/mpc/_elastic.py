@@ -104,10 +104,19 @@ def elastic_limits(
     moving_costs = weights / np.maximum(squares, _TINY) ** 2 * missed**2
     moving_cost = moving_costs.sum()
     cost = min(max(free_cost, last_cost), 2.0 * free_cost) + moving_cost
+    least_price = max(WORTH * cost / max(missed.sum(), _TINY), NO_PRICE)
     return ElasticLimits(
-        least_price=WORTH * cost / max(missed.sum(), _TINY),
+        least_price=_rounded(least_price),
         extra_cost=SHARE * (free_cost + moving_cost),
     )
+
+
+def _rounded(price: float) -> float:
+    """Returns a price of few digits, a quarter of a power of two.
+
+    Else what rounding does to the cost of a plan would change the plan.
+    """
+    return 2.0 ** (np.floor(4.0 * np.log2(price) + 0.5) / 4.0)
 
 
 def _by_stage(parts: Array, horizon: int) -> Array:
