@@ -53,12 +53,14 @@ class ControllerStruct:
     Attributes:
         fields: What it keeps from step to step, as a view of its memory.
         size: Bytes.
+        seconds: That the code took for the last step [s].
     """
 
     def __init__(self, size: int, fields_type: Any):
         self._memory = ctypes.create_string_buffer(size)
         self.fields = fields_type.from_buffer(self._memory)
         self.size = size
+        self.seconds = 0.0
 
 
 class CompiledLibrary:
@@ -163,12 +165,15 @@ class CompiledLibrary:
             numbers = [measured]
             _check_shape("a measurement", measured, (self._measured,))
         arrays = [np.ascontiguousarray(part, dtype=self.dtype) for part in numbers]
-        step(
+        arguments = (
             ctypes.byref(controller.fields),
             *(_address(array) for array in arrays),
             ctypes.byref(reference),
             _address(input),
         )
+        began = perf_counter()
+        step(*arguments)
+        controller.seconds = perf_counter() - began
         return input.astype(float)
 
 
@@ -228,9 +233,8 @@ class CompiledController:
         if previous is not None:
             _continue(fields, previous)
         followed = self._library.reference(reference, parameters)
-        began = perf_counter()
         input = self._step(belief, followed)
-        timing = Timing(solve=perf_counter() - began)
+        timing = Timing(solve=self._struct.seconds)
         return _decision(fields, input, timing)
 
     def _step(self, belief: Gaussian, reference: Any) -> Array:
@@ -278,7 +282,7 @@ class CompiledLoop:
     Attributes:
         status: Of the last step.
         failed: Whether its input was chosen by the policy.
-        seconds: That the last step took [s].
+        seconds: That the code took for the last step [s].
         memory_bytes: Of the controller.
     """
 
@@ -330,9 +334,8 @@ class CompiledLoop:
             measured = read_array("measured", measured, names)
         followed = read_reference(reference).in_order(self._signals)
         converted = self._library.reference(followed, parameters)
-        began = perf_counter()
         input = self._library.step(self._struct, measured, converted)
-        self.seconds = perf_counter() - began
+        self.seconds = self._struct.seconds
         fields = self._struct.fields
         self.status = _STATUSES[fields.status]
         self.failed = bool(fields.failed)
