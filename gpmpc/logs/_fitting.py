@@ -35,9 +35,8 @@ _EVALUATIONS = 15
 _COUNTED_STEPS = 8  # steps of a rollout whose errors count
 _BATCH = 40_000  # states of one batch of rollouts: parameter vectors times windows
 _BLOCK = 4  # consecutive windows whose errors are correlated
-# [time steps] of a first-order lag, at which the search begins. From a longer one the
-# search may jump over a lag of few steps to below zero, where nothing pulls it back.
-_FIRST_TIME_CONSTANT = 1.0
+_FIRST_TIME_CONSTANT = 0.03  # [s] of a first-order lag, at which the search begins,
+_FIRST_STEPS = (1.0, 30.0)  # or this many time steps at least and at most
 _DIVERGED = 1e6  # residual of a rollout that is not finite
 
 
@@ -91,8 +90,7 @@ def fit_nominal(
         raise ShapeError(f"theta0 must have {count} entries; got {theta0.shape}")
     windows = log.windows(steps, past=max(model.past, PAST), most=_WINDOWS)
     lags = len(model.time_constants)
-    first_time_constants = np.full(lags, _FIRST_TIME_CONSTANT * log.time_step)
-    theta0 = np.concatenate([theta0, first_time_constants])
+    theta0 = np.concatenate([theta0, np.full(lags, _first_lag(log.time_step))])
     bounds = _bounds(model, lags)
     if not ((bounds[0] <= theta0) & (theta0 <= bounds[1])).all():
         rule = "must lie between the parameters' bounds"
@@ -101,12 +99,26 @@ def fit_nominal(
         return NominalFit(replace(model, theta=theta0), standard_errors=theta0)
     residuals = _RolloutResiduals(model, windows, steps, bounds)
     theta = _minimize(residuals, theta0)
+    if lags and theta[count:].min() <= 0 and theta0[-1] > log.time_step:
+        # The search jumped below zero, where nothing pulls a lag back.
+        from_a_step = np.concatenate([theta0[:count], np.full(lags, log.time_step)])
+        theta = min(theta, _minimize(residuals, from_a_step), key=residuals.loss)
     time_constants = np.maximum(theta[count:], 0.0)
     standard_errors = _standard_errors(
         J=residuals.jacobian(theta), residuals=residuals.of_windows(theta[None])[0]
     )
     fitted = replace(model, theta=theta[:count], time_constants=time_constants)
     return NominalFit(fitted, standard_errors[:count])
+
+
+def _first_lag(time_step: float) -> float:
+    """Returns the time constant of lags [s] at which the search begins.
+
+    Lags of far less than a time step show nothing of themselves, nor do those that are
+    far longer than a rollout.
+    """
+    fewest, most = time_step * np.array(_FIRST_STEPS)
+    return float(np.clip(_FIRST_TIME_CONSTANT, fewest, most))
 
 
 def _minimize(residuals: "_RolloutResiduals", theta0: Array) -> Array:
@@ -187,6 +199,11 @@ class _RolloutResiduals:
         return np.nan_to_num(
             residuals, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED
         )
+
+    def loss(self, theta: Array) -> float:
+        """Computes the loss that is minimised, of a parameter vector (P,)."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return float(np.sum(np.sqrt(1 + self(theta) ** 2) - 1))
 
     def jacobian(self, theta: Array) -> Array:
         """Computes the derivatives of the residuals by the parameters, a column each.
