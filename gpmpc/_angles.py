@@ -27,6 +27,21 @@ def wrap(angle: Any) -> Any:
     return angle - whole_turns(angle)
 
 
+def arc(angles: NDArray[np.float64]) -> tuple[float, float]:
+    """Returns beginning and end of the shortest arc that holds angles [rad].
+
+    It begins in [-pi, pi], and may end beyond.
+
+    Args:
+        angles: At least one (N,), with any whole turns.
+    """
+    ordered = np.sort(wrap(angles))
+    gaps = np.append(np.diff(ordered), ordered[0] + TURN - ordered[-1])
+    widest = int(np.argmax(gaps))
+    first = float(ordered[(widest + 1) % len(ordered)])
+    return first, first + TURN - float(gaps[widest])
+
+
 def state_difference(one: Any, other: Any, angles: Sequence[int]) -> Any:
     """Returns the difference of states (..., n), its angles within half a turn.
 

@@ -19,9 +19,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
 from gpmpc.logs._log import Log, LogRun
+from gpmpc.logs._ranges import ranges_of, shares_inside
 
 MANY_RUNS = 4  # from which on whole runs are dealt
 _SHORT = 3000  # rows of a log, below which it has more folds
@@ -50,7 +50,8 @@ class Folds:
     parts: tuple[Fold, ...]  #: two or more
     words: str  #: how the log was split
     #: share of held-out rows inside the range of the rows that models are fitted to,
-    #: for the fold and the state or input that are covered worst
+    #: or beyond it by 2 % of it at most, for the fold and the state or input that are
+    #: covered worst
     coverage: float
 
     @property
@@ -97,8 +98,10 @@ def _split(log: Log, count: int, past: int, steps: int) -> Folds | None:
     for blocks in _BLOCKS:
         folds = _blocks(log, count, blocks, past, steps)
         if folds is not None:
-            is_short = len(log) / blocks < _ROLLOUTS * steps
-            (short if is_short else splits).append(folds)
+            if len(log) / blocks < _ROLLOUTS * steps:
+                short.append(folds)
+            else:
+                splits.append(folds)
     return _best(splits or short)
 
 
@@ -116,8 +119,9 @@ def _deals_of_runs(log: Log, folds: int, past: int, steps: int) -> list[Folds]:
     count = len(runs)
     deals = [tuple(tuple(range(first, count, folds)) for first in range(folds))]
     if folds == 2:
-        for half in _deals(count):
-            deals.append((half, tuple(i for i in range(count) if i not in half)))
+        for first_fold in _deals(count):
+            second_fold = tuple(i for i in range(count) if i not in first_fold)
+            deals.append((first_fold, second_fold))
     splits = []
     for deal in deals:
         held_out = [tuple(runs[i] for i in own) for own in deal]
@@ -257,12 +261,15 @@ def _folds(
     Args:
         log: That the runs are of.
         held_out: Runs that each fold holds out.
-        train: Runs that its models are fitted to; none where it is of no use.
+        train: Runs that its models are fitted to, likewise.
         words: How the log was split.
     """
     parts = tuple(
-        Fold(replace(log, runs=others), replace(log, runs=own))
-        for own, others in zip(held_out, train, strict=True)
+        Fold(
+            train=replace(log, runs=train_runs),
+            held_out=replace(log, runs=held_out_runs),
+        )
+        for held_out_runs, train_runs in zip(held_out, train, strict=True)
     )
     return Folds(parts, words, min(_coverage(fold) for fold in parts))
 
@@ -286,15 +293,5 @@ def _coverage(fold: Fold) -> float:
 
     It is that of the state or input that is covered worst.
     """
-    train = _rows(fold.train)
-    held_out = _rows(fold.held_out)
-    low = train.min(axis=0)
-    high = train.max(axis=0)
-    margin = _MARGIN * (high - low) + 1e-12
-    inside = (held_out >= low - margin) & (held_out <= high + margin)
-    return float(inside.mean(axis=0).min())
-
-
-def _rows(log: Log) -> Array:
-    """Returns states and inputs of all rows (N, n + m)."""
-    return np.concatenate([np.hstack([run.states, run.inputs]) for run in log])
+    ranges = ranges_of(fold.train)
+    return float(shares_inside(fold.held_out, ranges, _MARGIN).min())

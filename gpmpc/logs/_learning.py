@@ -12,8 +12,6 @@ from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import SettingError, check_kind, check_number
@@ -23,6 +21,7 @@ from gpmpc.logs._control_fitness import ControlFitness, judge_for_control
 from gpmpc.logs._fitting import STEPS, NominalFit
 from gpmpc.logs._folds import MANY_RUNS, split_folds
 from gpmpc.logs._log import Log
+from gpmpc.logs._ranges import ranges_of
 from gpmpc.logs._search import Search
 from gpmpc.logs._structures import Candidate, most_reach, past_rows
 from gpmpc.models._log_dynamics import OutputNoise
@@ -42,7 +41,8 @@ class IdentifiedModel:
     noise: OutputNoise  #: of its outputs
     fit: NominalFit  #: of the nominal part, to all runs
     candidates: tuple[Candidate, ...]  #: every structure that was tried, in order
-    #: smallest and largest value (2, n + m) of the states and inputs in the log
+    #: smallest and largest value (2, n + m) of the states and inputs in the log; those
+    #: of an angle are the shortest arc that holds it
     ranges: Array
     runs: tuple[str, ...]  #: names of the runs
     state_names: tuple[str, ...]  #: as the file's columns are called (n,)
@@ -88,7 +88,8 @@ def learn(
     Raises:
         SettingError: ``log`` is no log, or a setting is out of range, or a model for
             control has no input.
-        DataError: The log is too short for rollouts of that many steps.
+        DataError: No piece of the log is long enough for windows in every fold, even
+            of fewer steps.
         TrainingError: A GP could not be trained.
 
     See Also:
@@ -158,7 +159,7 @@ def _identify(
         noise=noise,
         fit=fit,
         candidates=search.candidates,
-        ranges=_ranges(log),
+        ranges=ranges_of(log),
         runs=tuple(run.name for run in log),
         state_names=log.mapping.column_names("states"),
         input_names=log.mapping.column_names("inputs"),
@@ -170,9 +171,3 @@ def _identify(
         control=control,
         namings=log.mapping.namings,
     )
-
-
-def _ranges(log: Log) -> Array:
-    """Returns the smallest and the largest value of states and inputs (2, n + m)."""
-    values = np.concatenate([np.hstack([run.states, run.inputs]) for run in log])
-    return np.stack([values.min(axis=0), values.max(axis=0)])

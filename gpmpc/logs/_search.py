@@ -30,6 +30,7 @@ from gpmpc.logs._log import Log
 from gpmpc.logs._stability import grows_outside
 from gpmpc.logs._structure_fits import StructureFits
 from gpmpc.logs._structures import (
+    Addition,
     Candidate,
     GroupGP,
     Structure,
@@ -69,7 +70,9 @@ class Search:
         seed: Of every random number.
         progress: Called with a line for each structure.
         memory: By the key of a structure without GPs, the parameters of its nominal
-            model by fold (lists of numbers); of any other, its errors.
+            model by fold (lists of numbers); of any other, its errors. By "simulation
+            of" a key, the logarithms of the errors of its simulations; by "averages of"
+            one, the shares and errors of its corrections.
         for_control: Leaves out what no controller can plan with.
     """
 
@@ -149,8 +152,9 @@ class Search:
         if self._for_control:
             return
         self._consider_correction(self.best)
-        # What is stable by half of the rows need not be so by all.
-        while self._is_unstable_by_all_rows(self.best):
+        # What is stable by half of the rows need not be so by all. This ends: what is
+        # marked falls behind, and a constant state is never unstable.
+        while self._mark_if_unstable_by_all_rows(self.best):
             self._consider_correction(self.best)
 
     def score(self, structure: Structure) -> float:
@@ -159,7 +163,7 @@ class Search:
         return self._logarithm(structure) + _PIECE * structure.size - hedge
 
     def _logarithm(self, structure: Structure) -> float:
-        """Computes the mean logarithm of errors over those of the best baselines."""
+        """Computes the score without what a structure's pieces cost."""
         logarithms = self._held_out.logarithms(self._errors[structure.key])
         simulated = self._simulated[structure.uncorrected.key]
         if len(simulated):
@@ -200,12 +204,19 @@ class Search:
             if addition.for_control or not self._for_control
         ]
         for removed in structure.additions:
-            smaller: Structure | None = self._base_of(structure)
-            for addition in structure.additions:
-                if addition is not removed and smaller is not None:
-                    smaller = smaller.extended(addition)
-            neighbours.append(smaller)
+            neighbours.append(self._without(structure, removed))
         return [one for one in neighbours if one is not None and self._has_rows(one)]
+
+    def _without(self, structure: Structure, removed: Addition) -> Structure | None:
+        """Builds a structure anew without an addition.
+
+        Returns None where another addition needs the one that is removed.
+        """
+        smaller: Structure | None = self._base_of(structure)
+        for addition in structure.additions:
+            if addition is not removed and smaller is not None:
+                smaller = smaller.extended(addition)
+        return smaller
 
     def _has_rows(self, structure: Structure) -> bool:
         """Returns whether lags can be fitted, and judged on rows that were held out.
@@ -232,7 +243,7 @@ class Search:
     def _consider_nominal(self, structure: Structure, parent: Structure | None) -> None:
         """Considers a nominal structure, fitted from the parameters of another."""
         models = self._fits.fit_nominal(structure, parent)
-        self._marks_as_unstable(structure, models)
+        self._mark_if_unstable(structure, models)
         self._measure(structure, models)
 
     # 2. combinations of groups of outputs
@@ -410,8 +421,8 @@ class Search:
             self._memory[structure.key] = self._held_out.mean(models).tolist()
             errors = np.array(self._memory[structure.key])
             self._memory[key] = self._simulate(models, errors).tolist()
-        self._simulated[structure.key] = np.array(self._memory[key])
-        self._enter(structure, np.array(self._memory[structure.key]))
+        errors = np.array(self._memory[structure.key])
+        self._enter_simulated(structure, errors, np.array(self._memory[key]))
 
     # 4. corrections by the past
 
@@ -442,10 +453,13 @@ class Search:
 
     # what all of them need
 
-    def _marks_as_unstable(
+    def _mark_if_unstable(
         self, structure: Structure, models: Sequence[LogModel]
     ) -> bool:
-        """Marks a structure one of whose models grows outside of its data; says so."""
+        """Marks a structure if one of its models grows outside of its data.
+
+        Returns whether it is unstable.
+        """
         inputs = len(self._log.input_names)
         time_step = self._log.time_step
         is_unstable = any(grows_outside(model, inputs, time_step) for model in models)
@@ -453,10 +467,13 @@ class Search:
             self._unstable.add(structure.nominal.key)
         return is_unstable
 
-    def _is_unstable_by_all_rows(self, structure: Structure) -> bool:
-        """Marks a structure whose model of all rows grows outside; says so."""
+    def _mark_if_unstable_by_all_rows(self, structure: Structure) -> bool:
+        """Marks a structure if its model of all rows grows outside of its data.
+
+        Returns whether it is unstable.
+        """
         fit = self._fits.fit_to_all_runs(structure)
-        return self._marks_as_unstable(structure, [fit.model])
+        return self._mark_if_unstable(structure, [fit.model])
 
     def _measure(self, structure: Structure, models: Sequence[LogModel]) -> None:
         """Enters a nominal structure with the errors of its models."""
@@ -464,8 +481,22 @@ class Search:
         key = f"simulation of {structure.key}"
         if key not in self._memory:
             self._memory[key] = self._simulate(models, errors).tolist()
-        self._simulated[structure.key] = np.array(self._memory[key])
+        self._enter_simulated(structure, errors, np.array(self._memory[key]))
+
+    def _enter_simulated(
+        self, structure: Structure, errors: Array, simulated: Array
+    ) -> None:
+        """Enters a candidate with its errors and those of its simulations.
+
+        They may be of an earlier call: what comes next is then reached as it was there.
+        """
+        self._best_logarithm = min(self._best_logarithm, self._mean_logarithm(errors))
+        self._simulated[structure.key] = simulated
         self._enter(structure, errors)
+
+    def _mean_logarithm(self, errors: Array) -> float:
+        """Computes the mean logarithm of errors over those of the best baselines."""
+        return float(self._held_out.logarithms(errors).mean())
 
     def _simulate(self, models: Sequence[LogModel], errors: Array) -> Array:
         """Simulates long held-out rows; returns the logarithms of errors (g,), or none.
@@ -474,9 +505,7 @@ class Search:
         """
         if self._simulation is None:
             return np.empty(0)
-        logarithm = self._held_out.logarithms(errors).mean()
-        self._best_logarithm = min(self._best_logarithm, logarithm)
-        if logarithm > self._best_logarithm + _OUT_OF_REACH:
+        if self._mean_logarithm(errors) > self._best_logarithm + _OUT_OF_REACH:
             return self._simulation.worst_logarithms
         return self._simulation.logarithms(models)
 

@@ -161,7 +161,7 @@ class Structure:
 
     def extended(self, addition: Addition) -> "Structure | None":
         """Returns the structure with an addition; None where that makes no sense."""
-        if self.parts or addition in self.additions:
+        if self.parts or addition.key in {one.key for one in self.additions}:
             return None
         model = addition.extend(self.model)
         if model is None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gpmpc._angles import TURN
+from gpmpc._angles import TURN, arc
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, to_array
 from gpmpc.exceptions import ShapeError
@@ -154,7 +154,7 @@ def _columns_of(gp: GPPosterior, states: list[int], angles: list[int]) -> list[_
         is_angle = state in angles
         width = 2 if is_angle else 1
         if is_angle:
-            low, high = _arc(np.arctan2(features[:, j], features[:, j + 1]))
+            low, high = arc(np.arctan2(features[:, j], features[:, j + 1]))
         else:
             low = float(features[:, j].min())
             high = float(features[:, j].max())
@@ -162,12 +162,3 @@ def _columns_of(gp: GPPosterior, states: list[int], angles: list[int]) -> list[_
         columns.append(_Column(state, low, high, lengthscale, angle=is_angle))
         j += width
     return sorted(columns)
-
-
-def _arc(angles: Array) -> tuple[float, float]:
-    """Returns beginning and end of the shortest arc that holds angles [rad]."""
-    ordered = np.sort(angles)
-    gaps = np.append(np.diff(ordered), ordered[0] + TURN - ordered[-1])
-    widest = int(np.argmax(gaps))
-    first = float(ordered[(widest + 1) % len(ordered)])
-    return first, first + TURN - float(gaps[widest])

@@ -15,6 +15,7 @@ from gpmpc.logs._control_fitness import judge_for_control
 from gpmpc.logs._folds import split_folds
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._noise import learning_gains
+from gpmpc.logs._ranges import ranges_of
 from gpmpc.logs._rollout_corrections import Rollouts, choose_averages
 from gpmpc.logs._search import Search
 from gpmpc.logs._smoothing import smooth
@@ -143,6 +144,28 @@ def test_runs_are_dealt_so_that_ranges_are_covered():
     states = [centre + rng.uniform(-1, 1, (rows, 2)) for centre, rows in runs]
     log = log_of(states, [rng.uniform(-1, 1, (rows, 1)) for rows in lengths])
     assert split_folds(log, past=23, steps=10).coverage > 0.95
+
+
+def test_turns_and_signs_that_runs_count_otherwise_are_covered():
+    """Headings that go on over a turn, and quaternions of the other sign."""
+    states = {
+        "heading": {"columns": ["h"], "kind": "angle", "unit": "rad"},
+        "attitude": {"columns": ["x", "y", "z", "w"], "kind": "quaternion"},
+    }
+    states["attitude"]["order"] = "xyzw"
+    mapping = LogMapping.from_dict({"states": states, "inputs": {"u": ["u"]}})
+    half = 0.3 * np.sin(0.1 * np.arange(80))
+    runs = []
+    for number in range(4):
+        sign = (-1) ** number
+        heading = np.pi + half + 2 * np.pi * number
+        attitude = sign * np.stack([np.sin(half), 0 * half, 0 * half, np.cos(half)])
+        runs.append(np.column_stack([heading, attitude.T]))
+    log = log_of(runs, [half[:, None]] * 4, mapping)
+    assert split_folds(log, past=5, steps=5).coverage == 1.0
+    low, high = ranges_of(log)[:, [0, 4]].T
+    np.testing.assert_allclose(low, np.pi + np.array([-0.3, 0.3]), atol=1e-3)
+    np.testing.assert_allclose(high, [np.cos(0.3), 1.0], atol=1e-3)
 
 
 def test_coupled_outputs_are_learned_together():
