@@ -36,10 +36,12 @@ class Effect:
 
     input: str  #: its name
     output: str  #: likewise
-    gain: float  #: of the output by the input, from the rows
-    low: float  #: of the 95 % interval
+    #: of the output by the input, from the rows [unit of the output per unit of the
+    #: input, in SI units]
+    gain: float
+    low: float  #: of the 95 % interval of the gain, in its unit
     high: float  #: likewise
-    model: float  #: mean derivative of the model
+    model: float  #: mean derivative of the model, in the unit of the gain
 
 
 @dataclass(frozen=True)

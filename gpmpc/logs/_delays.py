@@ -97,7 +97,10 @@ def _without_units(values: Array) -> Array:
 
 
 def _differences(values: Array, length: int) -> Array:
-    """Returns centred differences (b, length - 1, c) in blocks spread over the rows."""
+    """Returns first differences (b, length - 1, c) in blocks spread over the rows.
+
+    The mean of each block is taken off.
+    """
     starts = np.unique(np.linspace(0, len(values) - length, BLOCKS).astype(int))
     blocks = [values[start : start + length] for start in starts]
     steps = np.nan_to_num(np.diff(blocks, axis=1))

@@ -27,7 +27,8 @@ class FreeSimulation:
     """Long windows of what each fold holds out."""
 
     windows: tuple[Windows, ...]  # of each fold
-    spread: Array  # of what is simulated, by group (g,)
+    #: root mean square length of the deviations from the mean, by group (g,)
+    spread: Array
 
     @classmethod
     def of(

@@ -207,7 +207,8 @@ class Log:
             ahead: Rows after the start of each.
             past: Rows before it.
             stride: Rows from one start to the next.
-            most: Number of windows, about; the stride follows from it.
+            most: Number of windows, about; the stride follows from it. Several pieces
+                may exceed it by less than one window each.
 
         Raises:
             DataError: No piece is as long.

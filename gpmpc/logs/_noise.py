@@ -312,6 +312,7 @@ def _responses(
     carried = model.rollout_carried(windows, max(steps))
     E = carried.shape[-1] - windows.space.dim + e
     by_start = np.zeros((W, len(steps), e, E))
+    # tails[t] = sum over j > k of rho^(j - k) G_j
     tails = np.zeros((len(time_constants), W, len(steps), e, o))
     sums = np.zeros_like(tails)
     rhos = [np.exp(-1 / max(constant, 1e-9)) for constant in time_constants]

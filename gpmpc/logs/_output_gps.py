@@ -34,7 +34,7 @@ def train_output_gp(
         log: The data.
         outputs: Those that the GP adds to.
         rows: Consecutive rows over which a target is averaged; its features are those
-            of the row in the middle.
+            of the row in the middle, of an even number the later one of the two.
         points: Rows that the GP is trained on.
         seed: Of the choice of rows, and of the training.
         sees_memory: Whether it sees the regressors of the memory.

@@ -34,6 +34,7 @@ _SIGNIFICANT = 4.0  # standard errors by which a noise has to differ from none
 _LEAST_SHARE = 0.02  # of the residuals' variance that a noise has to make up
 _LAGS = 10  # over which what a model misses is correlated
 _MODELS = 3  # that are fitted in turn
+_LINEARIZATIONS = 2  # about the rows as they were, then about those smoothed by them
 _POINTS = 100  # of the GPs
 _AVERAGE = 5  # rows over which their targets are averaged
 _STIFF = 1e-3  # least noise of the movement, over that of the measurements
@@ -70,17 +71,19 @@ def smooth(log: Log, kinematics: Kinematics, seed: int) -> Log | None:
         noise = _estimate_noise(model, log)
         if not noise.is_noisy.any():
             continue
-        for _ in range(2):
-            runs = zip(log.runs, smoothed.runs, strict=True)
-            smoothed = replace(
-                log,
-                runs=tuple(
-                    _smooth_run(model, measured, about, noise, log.time_step)
-                    for measured, about in runs
-                ),
-            )
+        for _ in range(_LINEARIZATIONS):
+            smoothed = _smooth_all(model, log, about=smoothed, noise=noise)
         is_smoothed = True
     return smoothed if is_smoothed else None
+
+
+def _smooth_all(model: LogModel, log: Log, about: Log, noise: _Noise) -> Log:
+    """Returns a log with the most likely states of every run; see ``_smooth_run``."""
+    runs = tuple(
+        _smooth_run(model, measured, about_run, noise, log.time_step)
+        for measured, about_run in zip(log.runs, about.runs, strict=True)
+    )
+    return replace(log, runs=runs)
 
 
 def _with_gps(model: LogModel, log: Log, seed: int) -> LogModel:
@@ -106,9 +109,9 @@ def _estimate_noise(model: LogModel, log: Log) -> _Noise:
     deviation = np.median(np.abs(e), axis=(0, 1)) / 0.6745
     e = np.clip(e, -_OUTLIER * deviation, _OUTLIER * deviation)
     variance = np.square(e).mean(axis=(0, 1))
-    by_lag = e[:, :1] * e  # (W, lags + 1, e)
-    products = by_lag[:, 2] - by_lag[:, 1]
-    long_run = by_lag.mean(axis=0)
+    products_by_lag = e[:, :1] * e  # (W, lags + 1, e)
+    products = products_by_lag[:, 2] - products_by_lag[:, 1]
+    long_run = products_by_lag.mean(axis=0)
     density = long_run[0] + 2 * long_run[1:].sum(axis=0)
     R = products.mean(axis=0)
     standard_error = products.std(axis=0) / np.sqrt(len(products))

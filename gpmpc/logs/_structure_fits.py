@@ -44,7 +44,8 @@ class StructureFits:
         steps: Of the rollouts.
         seed: Of every random number.
         memory: By the key of a structure without GPs, the parameters of its nominal
-            model by fold (lists of numbers).
+            model by fold (lists of numbers). What ``Search`` keeps there stays as it
+            is.
     """
 
     def __init__(
