@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from gpmpc._angles import state_difference
+from gpmpc._compiled import compiled
 from gpmpc._dynamics import linearize
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
@@ -206,11 +207,23 @@ def is_contradicted(guess: Plan, stages: Stages, ranges: Array) -> bool:
         stages: Linearised along it; one that is held contradicts nothing.
         ranges: Of the states in the model's data (n,).
     """
-    n = len(ranges)
     if len(stages.next) != len(guess.inputs):
         return False
-    misses = np.abs(stages.next[:, :n] - guess.states[1:, :n])
-    return bool((misses > MOST_RANGES * ranges).any())
+    return _leads_away(stages.next, guess.states, MOST_RANGES * ranges)
+
+
+@compiled
+def _leads_away(after, states, limits):
+    """Returns whether states (H + 1, p) are further from ``after`` than their limits.
+
+    ``after`` (H, p) is where the model leads from each stage; the limits are of the
+    first n states (n,).
+    """
+    for k in range(len(after)):
+        for i in range(len(limits)):
+            if abs(after[k, i] - states[k + 1, i]) > limits[i]:
+                return True
+    return False
 
 
 def motion_of(prediction: PredictionModel, guess: Plan, request: Request) -> Plan:
