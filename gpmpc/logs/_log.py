@@ -42,6 +42,7 @@ class LogRun:
     inputs: Array  #: (K, m), those applied from the row's time on
     context: Array  #: (K, c)
     begins: tuple[int, ...] = (0,)  #: first row of each piece; the first is 0
+    origin: str = ""  #: name of the run that this is a part of; empty of a whole one
 
     def __len__(self) -> int:
         return len(self.time)
@@ -78,6 +79,7 @@ class LogRun:
             inputs=self.inputs[rows],
             context=self.context[rows],
             begins=(0, *(b - begin for b in self.begins if begin < b < end)),
+            origin=self.origin or self.name,
         )
 
 

@@ -42,9 +42,12 @@ class Rollouts:
 
     windows: Windows
     predicted: Array  # (W, steps, n)
+    #: rows of the log at which the windows start (W,), where they are of parts of runs
+    rows: np.ndarray | None = None
 
-    def __getitem__(self, rows: Any) -> "Rollouts":
-        return Rollouts(self.windows[rows], self.predicted[rows])
+    def __getitem__(self, index: Any) -> "Rollouts":
+        rows = None if self.rows is None else self.rows[index]
+        return Rollouts(self.windows[index], self.predicted[index], rows)
 
     def distances(self, steps: Sequence[int]) -> Array:
         """Computes the errors (W, steps, groups) at some steps."""
@@ -58,6 +61,7 @@ class Rollouts:
         The runs are numbered anew.
         """
         windows = [part.windows for part in parts]
+        rows = [part.rows for part in parts if part.rows is not None]
         runs = []
         first = 0
         for one in windows:
@@ -73,7 +77,11 @@ class Rollouts:
             runs=np.concatenate(runs),
             times=np.concatenate([one.times for one in windows]),
         )
-        return cls(joined, np.concatenate([part.predicted for part in parts]))
+        return cls(
+            windows=joined,
+            predicted=np.concatenate([part.predicted for part in parts]),
+            rows=np.concatenate(rows) if len(rows) == len(parts) else None,
+        )
 
 
 class Averages(NamedTuple):
@@ -120,7 +128,7 @@ def _errors_on_other_runs(
     shape = len(_PRIORS), len(windows), len(judged_steps), windows.space.error_dim
     errors = np.empty(shape)
     for is_own in _parts_of_whole_runs(windows):
-        others = rollouts[~is_own]
+        others = rollouts[_are_apart(rollouts, is_own)]
         own = rollouts[is_own]
         corrections = Correction.fit_each(
             kinematics=kinematics,
@@ -133,6 +141,27 @@ def _errors_on_other_runs(
             corrected = correction(own.windows, own.predicted)
             errors[i, is_own] = own.windows.errors(corrected, judged_steps)
     return errors
+
+
+def _are_apart(rollouts: Rollouts, is_own: np.ndarray) -> np.ndarray:
+    """Finds the windows (W,) of others that share no row with those of a part.
+
+    The past of a block's first windows is the end of the block before: a correction
+    that was fitted there has seen it, and is no test of itself. Where no window is
+    apart, all others are taken.
+    """
+    if rollouts.rows is None:
+        return ~is_own
+    own_rows = np.sort(rollouts.rows[is_own])
+    following = np.searchsorted(own_rows, rollouts.rows)
+    next_row = own_rows[np.minimum(following, len(own_rows) - 1)]
+    last_row = own_rows[np.maximum(following - 1, 0)]
+    distances = np.minimum(
+        np.abs(rollouts.rows - next_row), np.abs(rollouts.rows - last_row)
+    )
+    are_near = distances <= rollouts.windows.past + rollouts.windows.ahead
+    are_apart = ~is_own & ~are_near
+    return are_apart if are_apart.any() else ~is_own
 
 
 def _choose_shares(errors: Array, runs: np.ndarray) -> Array:

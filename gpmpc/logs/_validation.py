@@ -21,6 +21,7 @@ from gpmpc.logs._structure_fits import StructureFits
 from gpmpc.logs._structures import Structure
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel
+from gpmpc.models._windows import Windows
 
 _CORRECTED_WINDOWS = 2400  # that a correction is fitted to
 #: of models of all rows, by those of three quarters and of halves
@@ -204,7 +205,25 @@ class Validations:
             predicted = model.rollout(windows)
             departures = np.abs(predicted - self._middle) / self._range
         stays_near = departures.max(axis=(1, 2)) < _LARGEST_DEPARTURE
-        return Rollouts(windows, predicted)[stays_near]
+        rows = self._rows_of(windows, held_out)
+        return Rollouts(windows, predicted, rows)[stays_near]
+
+    def _rows_of(self, windows: Windows, part: Log) -> np.ndarray:
+        """Returns the rows of the log at which windows of a part of it start (W,).
+
+        Runs count as far apart.
+        """
+        rows = np.empty(len(windows), dtype=int)
+        first = 0
+        for run in self._log:
+            name = run.origin or run.name
+            for number, own in enumerate(part):
+                if (own.origin or own.name) == name:
+                    is_own = windows.runs == number
+                    places = np.searchsorted(run.time, windows.times[is_own])
+                    rows[is_own] = first + places
+            first += 2 * len(run) + len(self._log)
+        return rows
 
     def _correct(
         self, model: LogModel, structure: Structure, rollouts: Sequence[Rollouts]
