@@ -1,5 +1,5 @@
 #include <float.h>
-#if DBL_MANT_DIG != 53
+#if defined(DBL_MANT_DIG) && DBL_MANT_DIG != 53
 #error "sums of the GPs need a double of 64 bits"
 #endif
 
