@@ -162,7 +162,8 @@ def estimate_delay(
 def _delays(longest: int, resolution: float) -> Array:
     """The delays that are tried (T,) [steps], from zero to at most ``longest``."""
     count = int(np.floor(longest / resolution + 1e-9)) + 1
-    return (np.arange(count) * float(resolution)).round(9)
+    delays = np.arange(count, dtype=np.float64) * float(resolution)
+    return np.round(delays, 9)
 
 
 def _independent_changes(changes: Array, state_basis: Array) -> Array:

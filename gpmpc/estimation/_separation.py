@@ -83,7 +83,10 @@ def separate_noise(
         )
     # All that was learned, also where it was separated before.
     gp_with_all = replace(gp, noise_variance=noise)
-    model = gp_with_all if gp is model else replace(model, residual=gp_with_all)
+    if isinstance(model, ResidualModel):
+        model = replace(model, residual=gp_with_all)
+    else:
+        model = gp_with_all
     errors = to_array(residuals(model, transitions, block).errors)
     successive = follows_previous(model, transitions)
     later = 1 + np.flatnonzero(successive.cpu().numpy())
