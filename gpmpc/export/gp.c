@@ -129,7 +129,7 @@ static void gp_evaluate(const gp_tables *gp, const real *query, gpmpc_work *work
                 kernel[i] = exponent - half3 * (third[i] * third[i]);
             }
         }
-        for (; j < d; j++) {
+        for (j = d / 3 * 3; j < d; j++) {
             const wide *difference = differences + j * count;
             wide half_scale = scales[j] / 2;
             for (i = 0; i < count; i++)
