@@ -109,6 +109,8 @@ def _sparse(gp: GPPosterior, count: int) -> GPPosterior:
         targets=sparse.targets + gp.offset,
         offset=gp.offset,
         signals=gp.signals,
+        # less than what was observed with, where the process' part was told apart
+        noise_variance=gp.noise_variance,
     )
 
 
@@ -121,9 +123,12 @@ def _means_at_points(gp: GPPosterior) -> Any:
 
 
 def _hyperparameters(gp: GPPosterior) -> Hyperparameters:
-    """Returns the hyperparameters of GPs."""
+    """Returns the hyperparameters of GPs, with the noise of what was observed."""
+    noise = gp.observation_noise
+    if noise is None:
+        noise = gp.noise_variance
     return Hyperparameters(
         lengthscales=gp.lengthscales,
         signal_variance=gp.signal_variance,
-        noise_variance=gp.noise_variance,
+        noise_variance=noise,
     )

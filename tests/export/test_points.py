@@ -1,6 +1,7 @@
 """Fewer points decide nearly as all do, and as many are chosen as a budget holds."""
 
 import shutil
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -113,6 +114,17 @@ def test_sparse_models_get_sparser():
     difference, ratios = errors(trained, with_points(trained, 20))
     assert difference < 0.02
     assert ratios.min() > 0.5
+
+
+def test_a_separated_noise_stays_that_of_the_process():
+    """The rows keep the noise that they were observed with: means do not follow it."""
+    noisy = pendulum_posterior(noise=0.01)
+    separated = replace(noisy, noise_variance=1e-4 * noisy.noise_variance)
+    fewer = with_points(separated, 30)
+    states, inputs = queries()
+    expected = with_points(noisy, 30).predict(states, inputs).mean
+    assert (fewer.predict(states, inputs).mean - expected).abs().max() < 1e-9
+    assert torch.equal(fewer.noise_covariance, separated.noise_covariance)
 
 
 def test_models_around_gps_get_fewer_points():
