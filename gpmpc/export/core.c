@@ -76,6 +76,34 @@ static void add_scaled(real factor, const real *x, real *y, int size)
         y[i] += factor * x[i];
 }
 
+/* y <- y + sum_j (sign factors_j) x_j for rows x_j of N numbers, of which the first
+   ``size`` count; the factors lie ``step`` apart. Four rows at a time, so that y is read
+   and written once for them. */
+static void add_combination(real sign, const real *factors, int step,
+                            real (*x)[GPMPC_SIZE], int count, real *restrict y,
+                            int size)
+{
+    int i, j;
+    for (j = 0; j + 4 <= count; j += 4) {
+        const real *first = x[j];
+        const real *second = x[j + 1];
+        const real *third = x[j + 2];
+        const real *fourth = x[j + 3];
+        real factor1 = sign * factors[j * step];
+        real factor2 = sign * factors[(j + 1) * step];
+        real factor3 = sign * factors[(j + 2) * step];
+        real factor4 = sign * factors[(j + 3) * step];
+        for (i = 0; i < size; i++) {
+            real sum = y[i] + factor1 * first[i];
+            sum += factor2 * second[i];
+            sum += factor3 * third[i];
+            y[i] = sum + factor4 * fourth[i];
+        }
+    }
+    for (; j < count; j++)
+        add_scaled(sign * factors[j * step], x[j], y, size);
+}
+
 /* out <- A x, A (rows, columns) */
 static void multiply(const real *A, const real *x, int rows, int columns, real *out)
 {
@@ -746,22 +774,19 @@ static void add_states(gpmpc_problem *problem, gpmpc_program *program)
         for (i = 0; i < n; i++) {
             real *next = problem->gamma[1 - now][i];
             fill(next, 0, before);
-            for (j = 0; j < n; j++)
-                add_scaled(problem->A[stage][i][j], problem->gamma[now][j], next,
-                           before);
+            add_combination(1, problem->A[stage][i], 1, problem->gamma[now], n, next,
+                            before);
             copy(problem->B[stage][i], next + before, m);
         }
         now = 1 - now;
         for (i = 0; i < m; i++)
-            for (j = 0; j < n; j++)
-                add_scaled(problem->BM[k][i][j], problem->gamma[now][j],
-                           program->P[before + i], width);
+            add_combination(1, problem->BM[k][i], 1, problem->gamma[now], n,
+                            program->P[before + i], width);
         for (e = 0; e < r; e++) {
             real *row = program->G[GPMPC_RATE_ROWS + k * r + e];
             fill(row, 0, N);
-            for (j = 0; j < n; j++)
-                add_scaled(ROW_BY_STATE(problem, k, e)[j], problem->gamma[now][j], row,
-                           width);
+            add_combination(1, ROW_BY_STATE(problem, k, e), 1, problem->gamma[now], n,
+                            row, width);
 #if GPMPC_SMOOTH
             add_scaled(1, problem->D[k][e], row + before, m);
 #endif
@@ -1007,19 +1032,17 @@ static void write_response(const gpmpc_problem *problem, int k,
 {
     int here = k * m;
     int width = here + m;
-    int i, j;
+    int i;
     for (i = 0; i < m; i++) {
         fill(next[n + i], 0, N);
-        for (j = 0; j < n + m; j++)
-            add_scaled(problem->feedback[k][i][j], response[j], next[n + i], here);
+        add_combination(1, problem->feedback[k][i], 1, response, n + m, next[n + i],
+                        here);
         next[n + i][here + i] = 1;
     }
     for (i = 0; i < n; i++) {
         fill(next[i], 0, N);
-        for (j = 0; j < n; j++)
-            add_scaled(problem->A[stage_of(k)][i][j], response[j], next[i], width);
-        for (j = 0; j < m; j++)
-            add_scaled(problem->B[stage_of(k)][i][j], next[n + j], next[i], width);
+        add_combination(1, problem->A[stage_of(k)][i], 1, response, n, next[i], width);
+        add_combination(1, problem->B[stage_of(k)][i], 1, next + n, m, next[i], width);
     }
 }
 
@@ -1056,11 +1079,9 @@ static void condense_with_feedback(gpmpc_controller *controller)
         }
         for (e = 0; e < r; e++) {
             real *row = program->G[N + GPMPC_RATE_ROWS + k * r + e];
-            for (j = 0; j < n; j++)
-                add_scaled(ROW_BY_STATE(problem, k, e)[j], next[j], row, width);
+            add_combination(1, ROW_BY_STATE(problem, k, e), 1, next, n, row, width);
 #if GPMPC_SMOOTH
-            for (j = 0; j < m; j++)
-                add_scaled(problem->D[k][e][j], next[n + j], row, width);
+            add_combination(1, problem->D[k][e], 1, next + n, m, row, width);
 #endif
         }
         now = 1 - now;

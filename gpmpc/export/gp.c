@@ -13,12 +13,14 @@ static wide power_of_two(wide shifted)
     return power;
 }
 
+/* The exponent of a kernel is at most log sf2; below -708 a kernel is nothing beside the
+   others, and 2^j would be subnormal. What is not a number stays so. */
 static wide exponential(wide x)
 {
-    wide j, y, g, half;
-    x = x < -750.0 ? -750.0 : x;
-    x = x > 720.0 ? 720.0 : x;
-    j = (x * 1.4426950408889634 + SHIFT) - SHIFT;
+    wide shifted, j, y, g;
+    x = x < -708.0 ? -708.0 : x;
+    shifted = x * 1.4426950408889634 + SHIFT;
+    j = shifted - SHIFT;
     y = (x - j * 0.6931471805599453) - j * 2.3190468138462996e-17;
     g = y * 2.510038319586702e-08 + 2.7620085455018414e-07;
     g = g * y + 2.7557268464831627e-06;
@@ -30,9 +32,7 @@ static wide exponential(wide x)
     g = g * y + 0.16666666666666669;
     g = g * y + 0.5000000000000001;
     g = (g * (y * y) + y) + 1.0;
-    /* 2^j in two halves, down to the subnormal numbers */
-    half = j * 0.5 + SHIFT;
-    return g * power_of_two(half) * power_of_two((j - (half - SHIFT)) + SHIFT);
+    return g * power_of_two(shifted);
 }
 
 /* Returns start + sum x_i, in eight interleaved parts as registers of eight numbers
@@ -67,6 +67,63 @@ static wide wide_dot(const wide *x, const wide *y, int size)
     return total;
 }
 
+#if defined(__GNUC__)
+/* Eight numbers as one value: gcc leaves several sums of eight as they are, which takes
+   twice as long. */
+__extension__ typedef wide eight __attribute__((vector_size(8 * sizeof(wide))));
+#else
+typedef struct {
+    wide lane[8];
+} eight;
+#endif
+
+/* sums <- sums + x y for eight numbers */
+static void add_products(eight *sums, const eight *x, const wide *y)
+{
+#if defined(__GNUC__)
+    eight now;
+    memcpy(&now, y, sizeof now);
+    *sums += *x * now;
+#else
+    int lane;
+    for (lane = 0; lane < 8; lane++)
+        sums->lane[lane] += x->lane[lane] * y[lane];
+#endif
+}
+
+static wide total_of(const eight *sums)
+{
+    wide parts[8];
+    memcpy(parts, sums, sizeof parts);
+    return ((parts[0] + parts[4]) + (parts[2] + parts[6]))
+           + ((parts[1] + parts[5]) + (parts[3] + parts[7]));
+}
+
+/* Writes x'y of three rows y, which follow each other: x is read once for them. The
+   sums are those of ``wide_dot``. */
+static void three_dots(const wide *x, const wide *y, int size, wide dots[3])
+{
+    eight first = {0};
+    eight second = {0};
+    eight third = {0};
+    int i;
+    for (i = 0; i + 8 <= size; i += 8) {
+        eight now;
+        memcpy(&now, x + i, sizeof now);
+        add_products(&first, &now, y + i);
+        add_products(&second, &now, y + size + i);
+        add_products(&third, &now, y + 2 * size + i);
+    }
+    dots[0] = total_of(&first);
+    dots[1] = total_of(&second);
+    dots[2] = total_of(&third);
+    for (; i < size; i++) {
+        dots[0] += x[i] * y[i];
+        dots[1] += x[i] * y[size + i];
+        dots[2] += x[i] * y[2 * size + i];
+    }
+}
+
 #if GPMPC_IS_FLOAT
 typedef struct gp_fixed_tables gp_fixed_tables;
 #endif
@@ -89,6 +146,23 @@ typedef struct {
 } gp_tables;
 
 /*{fixed}*/
+/* Writes d mean / dx~_j of one output from beta_i k_i and x~_ij - x~_j. */
+static void write_slopes(const wide *scales, const wide *weighted,
+                         const wide *differences, int count, int d, real *slopes)
+{
+    int j;
+    for (j = 0; j + 2 < d; j += 3) {
+        wide dots[3];
+        three_dots(weighted, differences + j * count, count, dots);
+        slopes[j] = (real)(scales[j] * dots[0]);
+        slopes[j + 1] = (real)(scales[j + 1] * dots[1]);
+        slopes[j + 2] = (real)(scales[j + 2] * dots[2]);
+    }
+    for (j = d / 3 * 3; j < d; j++)
+        slopes[j] =
+            (real)(scales[j] * wide_dot(weighted, differences + j * count, count));
+}
+
 /* Evaluates the GPs at x~ (d,) and, where they are wanted, their derivatives (k, d).
 
      mean_a = offset_a + sum_i beta_ai k_ai,   k_ai = exp(log sf2_a - |z_i|^2_a / 2)
@@ -140,9 +214,8 @@ static void gp_evaluate(const gp_tables *gp, const real *query, gpmpc_work *work
         for (i = 0; i < count; i++)
             weighted[i] = kernel[i] * weights[i];
         mean[a] = (real)sum(gp->offset[a], weighted, count);
-        for (j = 0; j < d && jacobian; j++)
-            jacobian[a * d + j] =
-                (real)(scales[j] * wide_dot(weighted, differences + j * count, count));
+        if (jacobian)
+            write_slopes(scales, weighted, differences, count, d, jacobian + a * d);
 #if GPMPC_KERNELS
         for (i = 0; i < count && work->lane >= 0; i++)
             work->kernels[(a * count + i) * GPMPC_LANES + work->lane] = kernel[i];

@@ -51,13 +51,14 @@ static void solve_transposed(const real *L, int stride, int end, real *a)
    early has as short a w_p. Returns whether P is positive definite and finite. */
 static int factorise(gpmpc_program *work)
 {
-    int i, j, s;
+    int i, j;
     for (i = N - 1; i >= 0; i--) {
         real *row = work->L[i];
         real pivot;
         copy(work->P[i], row, i + 1);
-        for (s = i + 1; s < N; s++)
-            add_scaled(-work->L[s][i], work->L[s], row, i + 1);
+        if (i < N - 1)
+            add_combination(-1, &work->L[i + 1][i], N, work->L + i + 1, N - 1 - i, row,
+                            i + 1);
         pivot = row[i];
         if (!(pivot > N * PIVOT_ROUNDING * work->P[i][i]) || !is_finite(pivot))
             return 0;
