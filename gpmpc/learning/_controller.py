@@ -55,17 +55,20 @@ class LearningController:
         reference: Reference,
         previous: Decision | None = None,
         parameters: Any = None,
+        plan: Any = None,
     ) -> Decision:
-        """Learns from the last step, and decides; see ``Controller.control``."""
+        """Learns from the last step, and decides; see ``GPMPC.control``."""
         start = perf_counter()
         check_arguments(belief, reference)
         if belief.names:
             belief = belief.in_order(self.signals.state_names)
         learned = self._learn(to_array(belief.mean).copy(), previous)
-        controller = self.controller
-        if learned.planning is not None:
-            controller = self.controller.with_model(learned.planning)
-        options = {} if parameters is None else {"parameters": parameters}
+        controller = self._with_change(learned)
+        options: dict[str, Any] = {}
+        if parameters is not None:
+            options["parameters"] = parameters
+        if plan is not None:
+            options["plan"] = plan
         learning_time = perf_counter() - start
 
         decision = controller.control(belief, reference, previous, **options)
@@ -75,6 +78,17 @@ class LearningController:
             decision = self.controller.control(belief, reference, previous, **options)
         timing = replace(decision.timing, model=decision.timing.model + learning_time)
         return replace(decision, timing=timing, learned=learned)
+
+    def gains(self, decision: Decision, parameters: Any = None) -> Array:
+        """Returns those of the controller, by the model that made the decision."""
+        controller = self._with_change(decision.learned)
+        return controller.gains(decision, parameters)
+
+    def _with_change(self, learned: LearningState | None) -> GPMPC:
+        """Returns the controller with the model that plans after a measurement."""
+        if learned is None or learned.planning is None:
+            return self.controller
+        return self.controller.with_model(learned.planning)
 
     def _learn(self, measured: Array, previous: Decision | None) -> LearningState:
         """Returns what the flight has taught up to a measurement (n,)."""

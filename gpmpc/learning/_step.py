@@ -20,6 +20,9 @@ from gpmpc.learning._state import Doubt, Expectation, LearningState
 # Differences of errors that say how large the noise is: at least, and at most.
 _FEWEST_RATIOS = 3
 _MOST_RATIOS = 100
+# Deviations of the noise from which on an error is no measurement: an invalid one, as
+# sensors mark it. Of such numbers even the squares are none.
+_ABSURD = 1e50
 _MISALIGNED = 0.1  # part of errors that no input explains, in deviations, at most
 _PATIENCE = 2  # further confirmations for steps that nothing explained, at most
 
@@ -40,6 +43,8 @@ def learn_from_step(
     input = np.array(input, dtype=float)
     measured = np.array(measured, dtype=float)
     observed = model.error(learning.state, input, measured)
+    if not (np.abs(observed.error) < _ABSURD * np.sqrt(model.gp_noise)).all():
+        return learning.after_gap(measured)
     noise_ratios = _with_noise_ratio(learning, observed.error)
     seen = learning.with_measurement(measured, observed.error, noise_ratios)
     if len(noise_ratios) < _FEWEST_RATIOS:

@@ -104,8 +104,11 @@ def states_along(model: ModelWithPast, measured: Array, inputs: Array) -> Array:
 
 
 def belief_of_all(belief: Gaussian, state: Array) -> Gaussian:
-    """Returns a belief over the whole state (n,); what is not measured is certain."""
-    covariance = torch.zeros(len(state), len(state), dtype=torch.float64)
+    """Returns a belief over the whole state (n,); what is not measured is certain.
+
+    It is of the type of the belief over what is measured.
+    """
+    covariance = belief.covariance.new_zeros(len(state), len(state))
     n = belief.mean.shape[-1]
     covariance[:n, :n] = belief.covariance
-    return Gaussian(torch.from_numpy(state), covariance)
+    return Gaussian(torch.from_numpy(state).to(belief.mean), covariance)

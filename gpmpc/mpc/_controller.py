@@ -228,7 +228,8 @@ class Decision:
     plan_novelty: float | Callable[[], float] = math.nan
     #: what the flight has taught a controller that learns (``gpmpc.learning``), for its
     #: next decision; with ``size``, the points of the model that decided, and
-    #: ``version``, how often it has changed
+    #: ``version``, how often it has changed; where it has ``later()``, that is what is
+    #: handed on after a step at which the controller was not called
     learned: Any = None
 
     def __post_init__(self) -> None:
@@ -395,6 +396,9 @@ class Request(NamedTuple):
         covariance = _as_array(belief.covariance)
         finite = _is_finite(state) and _is_finite(covariance)
         targets = _read_targets(reference, state, horizon, n)
+        if reference.inputs is None and problem.cost.penalized == "deviations":
+            rule = f"needs reference inputs ({horizon}, {m})"
+            raise ShapeError(f"penalized 'deviations' {rule}; got none")
         target_inputs = _read_target_inputs(reference, horizon, m)
         kappas = _read_kappas(reference)
         last_decision = previous if _can_continue(previous, horizon, n, m) else None
@@ -419,6 +423,15 @@ class Request(NamedTuple):
             previous=last_decision,
             guessed_states=states,
         )
+
+    def refuse_kappas(self, controller: str) -> None:
+        """Raises ``SettingError`` where the reference has kappas.
+
+        It is for a controller, by its name, that predicts no covariances.
+        """
+        if self.kappas is not None:
+            rule = "are for the predicted covariances of GPMPC"
+            raise SettingError("kappas", f"{rule}; {controller} predicts none")
 
     @property
     def constant_guess(self) -> Array:

@@ -7,7 +7,9 @@ is the list of alarms, in the order in which they are named to the user. What th
 for is told in ``_judgement``.
 
 A measurement that is missing is NaN. It is no innovation, it tells nothing of its
-sensor, and the plant counts as where the last plan predicted it.
+sensor, and the plant counts as where the last plan predicted it. Numbers beyond
+``LARGEST`` count as missing, in measurements and in plans: their squares are none, and
+one of them would stay in the sums of windows.
 """
 
 import math
@@ -43,6 +45,7 @@ _VIOLATED = 1e-6  # violation of a constraint from which on it counts as missed
 _CLIMBED = 0.1  # of its first cost, from which on plans that cost ever more count
 _RISEN = 2.0  # of its first cost, from which on they are lost
 _ROUNDING = 1e-9
+LARGEST = 1e100  # size of a number from which on it is no measurement and no plan
 _MEDIAN = 0.455  # of a chi-square of one degree
 
 # Why a step is not healthy.
@@ -76,6 +79,7 @@ STATE_MEMORY = np.dtype(
         ("motion", np.float64),  # largest squared predicted motion, forgotten slowly
         ("measured", np.float64),  # the last measurement
         ("repeats", np.float64),  # for how many steps the sensor has shown the same
+        ("missed_moves", np.float64),  # those of them in which it was to change
         ("is_coarse", np.float64),  # 1 where it has gone on after showing the same
         ("start", np.float64),  # the first measurement
         ("horizon_end", np.float64),  # the end of the last reference
@@ -94,17 +98,19 @@ FLIGHT_MEMORY = np.dtype(
         ("since_nearer", np.int64),  # steps since the plant came nearer to it
         ("violated", np.int64),  # steps for which plans have missed a constraint
         ("lost", np.int64),  # why it is lost, or ``HEALTHY``
-        ("travel", np.float64),  # from the start to the reference's end
+        ("longest_way", np.float64),  # from the start to the reference's end
         ("distance_when_lost", np.float64),
         ("first_violation", np.float64),
-        ("first_cost", np.float64),  # largest of plans while the reference was news
+        ("first_cost", np.float64),  # largest of the first plans to a new reference
+        ("awaits_cost", np.int64),  # 1 until there is a plan to the last news
         ("nearest", np.float64),  # distance
         ("distances", np.float64, _RING),
         ("costs", np.float64, _RING),  # of plans
         # modulo look_ahead: squared moves of the reference's end
         ("news", np.float64, _RING),
         ("paid", np.float64, _RING),  # modulo look_ahead: squared distances
-        # modulo look_ahead: by the plan of a step for the next look_ahead steps
+        # modulo look_ahead: by the plan of a step for the next look_ahead steps; NaN
+        # where there was none
         ("promised", np.float64, _RING),
         ("far", np.float64, WINDOW),  # 1 where a plan was far from the data
         ("failed", np.float64, WINDOW),  # 1 where a decision was not applied
@@ -141,6 +147,7 @@ class Reading(NamedTuple):
     last_covariances: Array  # (H + 1, n, n); NaN without a plan
     means: Array  # of the new plan (H + 1, n); NaN without one
     input: Array  # applied now (m,)
+    is_applied: bool  # whether the new plan is
     novelty: float
     violation: float
 
@@ -174,6 +181,13 @@ class _Course(NamedTuple):
     cost_climbs: bool  # faster and faster, while the distance has grown
 
 
+def new_flight_memory() -> Array:
+    """Returns the memory (1,) of all states together at the start of a flight."""
+    flight = np.zeros(1, FLIGHT_MEMORY)
+    flight["promised"] = np.nan
+    return flight
+
+
 def new_state_memory(count: int) -> Array:
     """Returns the memory of states (count,) at the start of a flight."""
     states = np.zeros(count, STATE_MEMORY)
@@ -185,30 +199,38 @@ def new_state_memory(count: int) -> Array:
 
 
 @compiled(locked=True, allocates=False)
+def all_usual(values):
+    """Returns whether all numbers (d,) are such as are measured and planned."""
+    count = 0
+    for value in values:
+        count += abs(value) < LARGEST
+    return count == len(values)
+
+
+@compiled(locked=True, allocates=False)
 def judge_step(settings, memory, reading):
     """Takes a step into the memory; returns the first alarm of the checks."""
     flight = memory.flight[0]
     horizon = len(reading.means) - 1
-    cost, promised = _plan_distances(settings, reading.means, reading.reference)
-    is_applied = cost == cost
-    if flight.look_ahead == 0 and is_applied:
+    planned_squares, promised = _plan_distances(settings, reading)
+    if flight.look_ahead == 0 and reading.is_applied:
         flight.look_ahead = min(horizon, _LONG)
 
     # The order counts: sensor variances come from the innovations, distances need these
     # variances, and a promise is followed after the news that may withdraw it.
     innovation, bias = _follow_innovations(settings, memory, reading)
-    frozen = _follow_sensors(memory, reading.measured)
+    frozen = _follow_sensors(settings, memory, reading)
     distance = _follow_distance(settings, memory, reading)
     _remember_reference(settings, memory, reading.reference)
-    _remember_first_cost(flight, cost)
+    _remember_first_cost(flight, planned_squares)
     promise_ratio = _follow_promise(flight, distance, promised, horizon)
-    course = _follow_course(flight, distance, cost, promise_ratio)
+    course = _follow_course(flight, distance, planned_squares, promise_ratio)
     far_plans = _follow_novelty(flight, reading.novelty)
     predicts_well = (
         innovation.reason == HEALTHY and bias.reason == HEALTHY and far_plans == 0.0
     )
-    lost = _follow_loss(flight, course, cost, predicts_well)
-    failures = _follow_failures(flight, is_applied)
+    lost = _follow_loss(flight, course, planned_squares, predicts_well)
+    failures = _follow_failures(flight, reading.is_applied)
     violation = _follow_violation(flight, reading.violation)
     standing = _follow_approach(flight, distance, horizon)
     saturated = _follow_bounds(settings, memory, reading.input, distance, horizon)
@@ -301,6 +323,8 @@ def _follow_innovation(settings, state, reading, i):
     size = _ROUNDING * max(1.0, abs(reading.measured[i]))
     variance = size * size + reading.last_covariances[1, i, i] + settings.model_noise[i]
     variance += _MISSED_MOTION * _MISSED_MOTION * motion
+    if variance != variance:  # the plan does not say how uncertain it is
+        return 0.0, 0.0
     ratio = innovation * innovation / (variance + state.sensor_variance)
     ratio = min(ratio, _CAP)
     deviation = innovation / math.sqrt(variance + state.sensor_variance / BIAS_WINDOW)
@@ -369,40 +393,58 @@ def _find(ordered, value):
 
 
 @njit_noalloc
-def _follow_sensors(memory, measured):
+def _follow_sensors(settings, memory, reading):
     """A state that is measured the same to the last digit while others change.
 
     A sensor that has shown the same before, and then gone on, has coarse steps: it may.
+    So may one without noise, whose state was to stay where it is.
     """
     changing = 0
+    measured = reading.measured
     for i in range(len(measured)):
         state = memory.states[i]
         if measured[i] != measured[i]:
             continue
         if measured[i] == state.measured:
             state.repeats += 1.0
+            state.missed_moves += _was_to_change(settings, state, reading, i)
         else:
             if state.repeats > 0.0:
                 state.is_coarse = 1.0
             state.repeats = 0.0
+            state.missed_moves = 0.0
             changing += 1
         state.measured = measured[i]
     if changing == 0 or memory.flight[0].changes < _FEWEST:
         return _WELL
     for i in range(len(measured)):
         state = memory.states[i]
-        if state.repeats >= WINDOW // 2 and state.is_coarse == 0.0:
+        if state.missed_moves >= WINDOW // 2 and state.is_coarse == 0.0:
             return Alarm(FROZEN, i, state.repeats)
     return _WELL
+
+
+@njit_noalloc
+def _was_to_change(settings, state, reading, i):
+    """Whether a sensor was to show another number, by its noise or by the last plan.
+
+    A plan that predicts nothing does not say that the state was to stay.
+    """
+    predicted = reading.last_means[1, i]
+    move = _wrapped(predicted - reading.measured[i], settings.angles[i])
+    size = _ROUNDING * max(1.0, abs(reading.measured[i]))
+    variance = reading.last_covariances[1, i, i] + settings.model_noise[i]
+    is_noisy = state.sensor_variance > size * size
+    return is_noisy or not move * move <= variance + size * size
 
 
 @njit_noalloc
 def _follow_distance(settings, memory, reading):
     """The distance from the reference in the cost's metric, and the least that matters.
 
-    No distance matters that is small beside the way travelled, or beside noise. Where
-    nothing is known of a state the distance stays as it was; it is infinite before any
-    is known.
+    No distance matters that is small beside the way from the start to the reference, or
+    beside noise. Where nothing is known of a state the distance stays as it was; it is
+    infinite before any is known.
     """
     flight = memory.flight[0]
     n = len(reading.measured)
@@ -413,7 +455,7 @@ def _follow_distance(settings, memory, reading):
     now = reading.reference[0]
     end = reading.reference[-1]
     square = 0.0
-    travel = 0.0
+    way_square = 0.0
     noise = 0.0
     for i in range(n):
         state = memory.states[i]
@@ -426,17 +468,17 @@ def _follow_distance(settings, memory, reading):
                 off_j = _wrapped(_present(reading, j) - now[j], settings.angles[j])
                 square += weight * off * off_j
                 way_j = _wrapped(end[j] - memory.states[j].start, settings.angles[j])
-                travel += weight * way * way_j
+                way_square += weight * way * way_j
         variance = settings.model_noise[i] + state.sensor_variance
         predicted = reading.last_covariances[1, i, i]
         if predicted == predicted:
             variance += predicted
         size = _ROUNDING * max(1.0, abs(present))
         noise += settings.weights[i, i] * (variance + size * size)
-    travel = math.sqrt(max(0.0, travel))
-    if travel == travel:
-        flight.travel = max(flight.travel, travel)
-    least = max(_MATERIAL * flight.travel, 4.0 * math.sqrt(noise))
+    if way_square == way_square:
+        way_length = math.sqrt(max(0.0, way_square))
+        flight.longest_way = max(flight.longest_way, way_length)
+    least = max(_MATERIAL * flight.longest_way, 4.0 * math.sqrt(noise))
     if square == square:
         return _Distance(math.sqrt(max(0.0, square)), least)
     if flight.step == 0:
@@ -493,23 +535,30 @@ def _move_of_end(settings, memory, end):
 
 
 @njit_noalloc
-def _remember_first_cost(flight, cost):
-    """Remembers the largest cost of plans while their reference was news.
+def _remember_first_cost(flight, planned_squares):
+    """Remembers the largest cost of the first plans that knew of a new reference.
 
     It is what the cost is to fall from.
     """
-    if flight.since_news == 0 and cost > flight.first_cost:
-        flight.first_cost = cost
+    if flight.since_news == 0:
+        flight.awaits_cost = 1
+    if flight.awaits_cost == 1 and planned_squares == planned_squares:
+        flight.first_cost = max(flight.first_cost, planned_squares)
+        flight.awaits_cost = 0
 
 
 @njit_noalloc
-def _plan_distances(settings, means, references):
+def _plan_distances(settings, reading):
     """Squared distances of a plan from its references: of all stages, and of the first.
 
-    Means are (H + 1, n); the first stages are as many as a promise is followed for. In
-    contrast to the stage costs of a decision these are distances alone, which any
-    controller's plan has and a measurement can be compared with.
+    The first stages are as many as a promise is followed for. In contrast to the stage
+    costs of a decision these are distances alone, which any controller's plan has and a
+    measurement can be compared with. They are NaN where no plan is applied.
     """
+    if not reading.is_applied:
+        return np.nan, np.nan
+    means = reading.means
+    references = reading.reference
     H = len(means) - 1
     n = means.shape[1]
     total = 0.0
@@ -544,7 +593,8 @@ def _follow_promise(flight, distance, promised, horizon):
     if k > 0:  # one wrong measurement costs nothing
         nearer = min(nearer, flight.distances[(k - 1) % _RING])
     flight.paid[slot] = nearer * nearer
-    # Noise was not promised, nor what prepares for a reference that is known later.
+    # The slot still holds what step k - h promised. Noise was not promised, nor what
+    # prepares for a reference that is known later.
     allowed = flight.promised[slot] + 0.25 * h * distance.least * distance.least
     is_comparable = min(horizon, _LONG) == h
     flight.promised[slot] = promised if is_comparable else np.nan
@@ -559,17 +609,17 @@ def _follow_promise(flight, distance, promised, horizon):
 
 
 @njit_noalloc
-def _follow_course(flight, distance, cost, promise_ratio):
+def _follow_course(flight, distance, planned_squares, promise_ratio):
     """Remembers distance and cost; returns where they have gone."""
     k = flight.step
     flight.distances[k % _RING] = distance.now
-    flight.costs[k % _RING] = cost
+    flight.costs[k % _RING] = planned_squares
     half = min(max(flight.look_ahead // 2, _GROWTH[0]), _GROWTH[1])
     was_away = flight.distances[(k - half) % _RING] > distance.least
     was_nearer = flight.distances[(k - 2 * half) % _RING] < distance.now
     cost_ratio = 0.0
     if flight.since_news > _LONG and flight.first_cost > 0.0:
-        cost_ratio = cost / flight.first_cost
+        cost_ratio = planned_squares / flight.first_cost
     return _Course(
         distance=distance.now,
         matters=distance.now > distance.least,
@@ -599,7 +649,7 @@ def _is_growing(ring, k, half):
 
 
 @njit_noalloc
-def _follow_loss(flight, course, cost, predicts_well):
+def _follow_loss(flight, course, planned_squares, predicts_well):
     """A plant that runs away, by its distance or by what its plans cost.
 
     It stays lost until it has come back by half.
@@ -607,7 +657,7 @@ def _follow_loss(flight, course, cost, predicts_well):
     if flight.lost != HEALTHY and course.distance < 0.5 * flight.distance_when_lost:
         flight.lost = HEALTHY
     if flight.lost == HEALTHY and course.matters:
-        is_far = course.distance > flight.travel
+        is_far = course.distance > flight.longest_way
         is_broken = course.promise_ratio > _BROKEN
         if course.distance_grows and is_broken and is_far:
             flight.lost = AWAY
@@ -617,7 +667,7 @@ def _follow_loss(flight, course, cost, predicts_well):
     if flight.lost == AWAY:
         return Alarm(AWAY, 0, course.distance)
     if flight.lost == RISING:
-        return Alarm(RISING, 0, cost / flight.first_cost)
+        return Alarm(RISING, 0, planned_squares / flight.first_cost)
     return _WELL
 
 
@@ -658,7 +708,7 @@ def _follow_novelty(flight, novelty):
 @njit_noalloc
 def _check_novelty(flight, course, far_plans, novelty):
     """Plans far from the data, on a way that is long or not as promised."""
-    is_on_its_way = course.distance > 0.5 * flight.travel
+    is_on_its_way = course.distance > 0.5 * flight.longest_way
     is_doubtful = course.promise_ratio > 0.5 * _BROKEN
     if far_plans >= _FEW and course.matters and (is_on_its_way or is_doubtful):
         return Alarm(NOVELTY, 0, novelty)
@@ -688,7 +738,7 @@ def _follow_approach(flight, distance, horizon):
         flight.since_nearer = 0
         return _WELL
     flight.since_nearer += 1
-    is_far = distance.now > max(distance.least, 0.5 * flight.travel)
+    is_far = distance.now > max(distance.least, 0.5 * flight.longest_way)
     if is_far and flight.since_nearer > 3 * max(_LONG, horizon):
         return Alarm(STANDING, 0, float(flight.since_nearer))
     return _WELL
@@ -702,7 +752,8 @@ def _follow_bounds(settings, memory, input, distance, horizon):
         size = _ROUNDING * max(1.0, abs(input[j]))
         is_low = input[j] <= settings.lower[j] + size
         if is_low or input[j] >= settings.upper[j] - size:
-            if memory.at_bound[j] == 0:
+            # It is infinite until a distance is known.
+            if memory.at_bound[j] == 0 or memory.distance_at_bound[j] == np.inf:
                 memory.distance_at_bound[j] = distance.now
             memory.at_bound[j] += 1
         else:

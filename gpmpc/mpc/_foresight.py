@@ -145,12 +145,16 @@ class Foresight:
     def arrives(self, costs: Array, dearest: float = 0.0) -> bool:
         """Tells whether the goal is held at the end of stages with costs (L,).
 
-        ``dearest`` is the cost of a stage before, where one is known.
+        ``dearest`` is the cost of a stage before, where one is known. Stages beyond a
+        hard bound, whose costs are infinite, say nothing of how dear a stage is.
         """
         if len(costs) < self._holding_stages:
             return False
-        limit = _NEAR_GOAL * max(dearest, float(costs.max()))
-        return bool((costs[-self._holding_stages :] <= limit).all())
+        last = costs[-self._holding_stages :]
+        if not np.isfinite(last).all():
+            return False
+        limit = _NEAR_GOAL * max(dearest, float(finite_costs(costs).max()))
+        return bool((last <= limit).all())
 
     def fly(
         self, beginning: Trajectory, question: Question, limit: float = np.inf
@@ -285,18 +289,34 @@ class Foresight:
         )
         return rolled_states[0], rolled_inputs[0]
 
-    def with_gains(self, flight: Flight) -> Flight:
-        """Returns a flight with the gains of the regulator of its own stages."""
+    def with_gains(self, flight: Flight, question: Question) -> Flight:
+        """Returns a flight with the gains of the regulator of its own stages.
+
+        Outputs weigh as they do along it.
+        """
         local = linearize(
             self._model, flight.states[:-1], flight.inputs, covariance=False
         )
-        cost = self.controller.prediction.problem.cost
+        problem = self.controller.prediction.problem
+        cost = problem.cost
+        Q = first_weight(cost.Q)[None]
+        R = first_weight(cost.R)[None]
+        terminal = cost.terminal
+        if problem.outputs:
+            Z = self.meter.output_weights(
+                flight.states, flight.inputs, question.parameters
+            )
+            n = flight.states.shape[1]
+            terminal = terminal + Z[-1, :n, :n]
+            # The regulator weighs x_0 .. x_{L-1}, Z what follows them.
+            Q = Q + np.concatenate([Z[:1], Z[:-1]])[:, :n, :n]
+            R = R + Z[:, n:-1, n:-1]
         gains = finite_horizon_lqr.unchecked(
             np.ascontiguousarray(local.A),
             np.ascontiguousarray(local.B),
-            np.ascontiguousarray(first_weight(cost.Q)[None]),
-            np.ascontiguousarray(first_weight(cost.R)[None]),
-            np.ascontiguousarray(cost.terminal),
+            np.ascontiguousarray(Q),
+            np.ascontiguousarray(R),
+            np.ascontiguousarray(terminal),
             len(flight),
         )[0]
         return replace(flight, gains=gains)
@@ -424,6 +444,11 @@ class _GrowingFlight:
             arrives=self._foresight.arrives(costs),
             plan=self._plan,
         )
+
+
+def finite_costs(costs: Array) -> Array:
+    """Returns those of costs that are finite."""
+    return costs[np.isfinite(costs)]
 
 
 def _swings(costs: Array) -> list[int]:

@@ -15,7 +15,7 @@ import numpy as np
 from gpmpc._angles import state_difference
 from gpmpc._compiled import compiled
 from gpmpc._dynamics import linearize
-from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._constraints import keep_rates
 from gpmpc.mpc._controller import (
@@ -61,7 +61,7 @@ def read_request(
     )
     if parameters is not None:
         request = request._replace(parameters=read_parameters(parameters, horizon))
-    _check_reference(prediction, reference, request)
+    _check_kappas(prediction, request)
     if not request.finite:
         return request
     if prediction.settings.disturbance_gain:
@@ -75,15 +75,8 @@ def read_request(
     return request
 
 
-def _check_reference(
-    prediction: PredictionModel, reference: Reference, request: Request
-) -> None:
-    """Raises an error where a reference lacks inputs, or has kappas without a use."""
-    deviations = prediction.problem.cost.penalized == "deviations"
-    if reference.inputs is None and deviations:
-        shape = f"({prediction.horizon}, {prediction.input_dim})"
-        rule = f"penalized 'deviations' needs reference inputs {shape}"
-        raise ShapeError(f"{rule}; got none")
+def _check_kappas(prediction: PredictionModel, request: Request) -> None:
+    """Raises ``SettingError`` where a reference has kappas without a use."""
     mode = prediction.settings.covariance
     if request.kappas is not None and mode != "zero_order":
         rule = "are for covariances of 'zero_order'"

@@ -149,7 +149,7 @@ class FlightJudge:
         )
         self._memory = checks.Memory(
             states=checks.new_state_memory(n),
-            flight=np.zeros(1, checks.FLIGHT_MEMORY),
+            flight=checks.new_flight_memory(),
             at_bound=np.zeros(m, dtype=np.int64),
             distance_at_bound=np.zeros(m),
         )
@@ -206,6 +206,7 @@ class FlightJudge:
         n = self._no_means.shape[1]
         measured = _float64(measured)
         _check_shape("measured", measured.shape, (n,))
+        measured = _usual(measured)
         references = _float64(reference)
         if references.ndim == 1:
             references = references[None]
@@ -226,6 +227,7 @@ class FlightJudge:
                 stages = max(len(means), 2)  # the next state is one of them
                 _check_shape("decision.means", means.shape, (stages, n))
                 _check_shape("decision.covariances", covariances.shape, (stages, n, n))
+                means = _usual(means)
                 # One that would have to be measured first is not worth the time here.
                 if not callable(decision.plan_novelty):
                     novelty = float(decision.plan_novelty)
@@ -238,6 +240,7 @@ class FlightJudge:
             last_covariances=self._covariances,
             means=means,
             input=input,
+            is_applied=decision is not None and decision.applicable,
             novelty=novelty,
             violation=violation,
         )
@@ -299,6 +302,16 @@ def _float64(values: Any) -> Array:
     if is_plain and values.flags.c_contiguous:
         return values
     return np.ascontiguousarray(values, dtype=np.float64)
+
+
+def _usual(values: Any) -> Array:
+    """Returns numbers, without a copy if they are such as are measured and planned.
+
+    Others are NaN: what is not finite, and what has no square.
+    """
+    if checks.all_usual.unchecked(values.ravel()):
+        return values
+    return np.where(np.abs(values) < checks.LARGEST, values, np.nan)
 
 
 # The words for plans that cost more again, but less than the first one still.

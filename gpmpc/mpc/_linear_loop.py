@@ -10,7 +10,7 @@ from scipy.linalg import eig, matrix_balance
 from gpmpc._dynamics import DynamicsModel, linearize, to_array
 from gpmpc.models import DelayedModel
 from gpmpc.mpc._linear_quadratic import INCREMENTS, QuadraticCost
-from gpmpc.mpc._linearization import PredictionModel
+from gpmpc.mpc._linearization import PredictionModel, PredictionSettings
 from gpmpc.mpc._rest_points import RestPoint, pending_inputs
 from gpmpc.mpc._riccati import finite_horizon_lqr
 from gpmpc.mpc._slopes import slope_covariances
@@ -36,6 +36,13 @@ class _Plant(NamedTuple):
     state: Array  # where, without the last inputs
 
 
+def observer_gain(settings: PredictionSettings) -> float:
+    """Returns the gain L of the estimate of the disturbance that settings mean."""
+    if settings.is_held:  # an increment holds all of the last error
+        return 1.0
+    return settings.disturbance_gain
+
+
 class LinearLoop:
     """The closed loop of a controller and a plant, linearised at a point.
 
@@ -55,10 +62,7 @@ class LinearLoop:
     ):
         self._point = point
         self.horizon = prediction.horizon
-        settings = prediction.settings
-        self._disturbance_gain = settings.disturbance_gain
-        if settings.is_held:  # an increment holds all of the last error
-            self._disturbance_gain = 1.0
+        self._disturbance_gain = observer_gain(prediction.settings)
         self._model: Any = plant or ahead or prediction.model
         learned = bool(to_array(self._model.noise_covariance).any())
         self._tolerance = _LEARNED if learned else _ROUNDING

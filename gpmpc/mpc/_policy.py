@@ -17,6 +17,7 @@ has and ``_conclude`` is to be given, and the controller, beside the name.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from inspect import Parameter, signature
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -68,9 +69,10 @@ class Command:
     #: of the controller, with this status; None where it was not called or returned
     #: inputs of another shape
     decision: Decision | None
-    #: what the next step goes on from: the decision that is applied now, or the last
-    #: applicable one, shifted to this step. Before any was: one that is not applicable,
-    #: whose ``input`` is what was applied. None where nothing was
+    #: the decision that the next step goes on from, not its plan alone: the one that is
+    #: applied now, or the last applicable one, shifted to this step. Before any was:
+    #: one that is not applicable, whose ``input`` is what was applied. None where
+    #: nothing was
     plan: Decision | None
     #: that the step began in (n,), of a model whose state holds its past; None of
     #: others. ``plan`` is of this state, ``decision`` of what is measured of it
@@ -110,6 +112,7 @@ def decide(
         plan: Likewise.
 
     Raises:
+        SettingError: The controller takes no parameters, or no plan.
         SolverFailure: The policy is ``"raise"``, or there is nothing to fall back on.
     """
     reference = reference.over(controller.horizon)
@@ -122,10 +125,34 @@ def decide(
     decision = None
     if _is_finite(situation.belief):
         previous = None if last is None else last.plan
-        decision = controller.control(
-            situation.belief, situation.reference, previous, **options
+        decision = _control(
+            controller, situation.belief, situation.reference, previous, options
         )
     return _conclude(controller, decision, situation, last, on_failure, step)
+
+
+def _control(
+    controller: Controller,
+    belief: Gaussian,
+    reference: Reference,
+    previous: Decision | None,
+    options: dict[str, Any],
+) -> Decision:
+    """Calls a controller, with parameters or a plan where there are some.
+
+    Raises:
+        SettingError: It takes none.
+    """
+    try:
+        return controller.control(belief, reference, previous, **options)
+    except TypeError as error:
+        known = signature(controller.control).parameters
+        takes_all = any(p.kind is Parameter.VAR_KEYWORD for p in known.values())
+        for key in options:
+            if key not in known and not takes_all:
+                rule = f"is nothing that {type(controller).__name__}.control takes"
+                raise SettingError(key, rule) from error
+        raise
 
 
 def _situation(
@@ -152,7 +179,8 @@ def decide_many(
     """Decides for many systems that follow one reference; see ``decide``.
 
     Where that would raise ``SolverFailure``, the error is returned instead. A
-    controller with ``control_many`` is called once for all of them.
+    controller whose ``control_many`` belongs to its ``control`` is called once for all
+    of them.
     """
     reference = reference.over(controller.horizon)
     situations = [
@@ -161,14 +189,14 @@ def decide_many(
     ]
     finite = [i for i, one in enumerate(situations) if _is_finite(one.belief)]
     plans = [None if command is None else command.plan for command in last]
-    control_many = getattr(controller, "control_many", None)
-    if control_many is None or len(beliefs) == 1:
+    if len(beliefs) == 1 or not _decides_together(controller):
         decided = [
             controller.control(situations[i].belief, situations[i].reference, plans[i])
             for i in finite
         ]
     else:
-        decided = control_many(
+        together: Any = controller
+        decided = together.control_many(
             [situations[i].belief for i in finite],
             [situations[i].reference for i in finite],
             [plans[i] for i in finite],
@@ -189,6 +217,21 @@ def decide_many(
             command = failure
         commands.append(command)
     return commands
+
+
+def _decides_together(controller: Controller) -> bool:
+    """Tells whether ``control_many`` decides as ``control`` does.
+
+    It does not where the latter was overridden alone: by a class below, by an attribute
+    of the object, or by a wrapper that hands all else on to what it wraps.
+    """
+    own = getattr(controller, "__dict__", {})
+    for names in (own, *map(vars, type(controller).__mro__)):
+        if "control_many" in names:
+            return True
+        if "control" in names:
+            return False
+    return False
 
 
 @explains_arguments
@@ -249,11 +292,12 @@ class ControlLoop:
             parameters: Of the controller's outputs and smooth constraints, where it has
                 any.
             plan: To start from in the place of the last one: inputs (H, m), or these
-                and states (H + 1, n).
+                and states (H + 1, n); for controllers that take one.
 
         Raises:
             ShapeError: State, reference, parameters or plan have other dimensions than
                 the controller.
+            SettingError: The controller takes no parameters, or no plan.
             SolverFailure: The policy is ``"raise"``.
         """
         signals = signals_of(self.controller)
@@ -414,6 +458,7 @@ def _conclude(
     if plan is None:
         rule = "no earlier plan and no reference input to fall back on"
         raise SolverFailure(step, f"{reason} ({rule})")
+    plan = replace(plan, learned=_learned_so_far(decision, last))
     return _command(plan, status, decision=decision, situation=situation)
 
 
@@ -428,6 +473,20 @@ def _command(
         plan=plan,
         state=situation.state,
     )
+
+
+def _learned_so_far(decision: Decision | None, last: Command | None) -> Any:
+    """Returns what a flight has taught when a decision is not applied.
+
+    A controller that was called has learned from the step; for one that was not, the
+    step counts as time.
+    """
+    if decision is not None and decision.learned is not None:
+        return decision.learned
+    learned: Any = None
+    if last is not None and last.plan is not None:
+        learned = last.plan.learned
+    return learned.later() if hasattr(learned, "later") else learned
 
 
 def _continue_last_plan(

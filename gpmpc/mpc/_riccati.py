@@ -205,7 +205,8 @@ def dlqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
         R: Weight of the input (m, m), positive definite.
 
     Raises:
-        SettingError: The inputs do not reach a mode that grows.
+        SettingError: The inputs do not reach a mode that grows, Q does not weigh one,
+            or Q or R is not what it has to be.
         ShapeError: The matrices do not belong together.
 
     >>> import numpy as np
@@ -217,10 +218,35 @@ def dlqr(A: Array, B: Array, Q: Array, R: Array) -> Array:
         ``Stability``, which says what a loop does near its rest.
     """
     A, B, Q, R = _square_system(A, B, Q, R)
+    _check_definite(Q, R)
     gains, _ = finite_horizon_lqr(A[None], B[None], Q[None], R[None], Q, _LONGEST)
     K = gains[0]
     finite = np.isfinite(K).all()
     if not finite or np.abs(np.linalg.eigvals(A - B @ K)).max() > 1 + _STABLE:
-        rule = "there is no stationary gain: the inputs do not reach a growing mode"
-        raise SettingError("A, B, Q", rule)
+        cause = "Q does not weigh a growing mode"
+        if not _reach_growing_modes(A, B):
+            cause = "the inputs do not reach a growing mode"
+        raise SettingError("A, B, Q", f"there is no stationary gain: {cause}")
     return K
+
+
+def _check_definite(Q: Array, R: Array) -> None:
+    """Raises ``SettingError`` unless Q is positive semidefinite and R definite."""
+    lowest = np.linalg.eigvalsh(0.5 * (Q + Q.T)).min()
+    if not lowest >= -_STABLE * np.abs(Q).max():
+        rule = "must be positive semidefinite"
+        raise SettingError("Q", f"{rule}; its smallest eigenvalue is {lowest:.3g}")
+    lowest = np.linalg.eigvalsh(0.5 * (R + R.T)).min()
+    if not lowest > 0:
+        rule = "must be positive definite"
+        raise SettingError("R", f"{rule}; its smallest eigenvalue is {lowest:.3g}")
+
+
+def _reach_growing_modes(A: Array, B: Array) -> bool:
+    """Tells whether inputs move all modes that grow (Hautus, 1969)."""
+    n = len(A)
+    for value in np.linalg.eigvals(A):
+        pencil = np.hstack([value * np.eye(n) - A, B])
+        if abs(value) > 1 + _STABLE and np.linalg.matrix_rank(pencil) < n:
+            return False
+    return True

@@ -35,7 +35,7 @@ from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError
 from gpmpc.models import DelayedModel
 from gpmpc.mpc._controller import read_reference
-from gpmpc.mpc._linear_loop import LinearLoop
+from gpmpc.mpc._linear_loop import LinearLoop, observer_gain
 from gpmpc.mpc._linearization import PredictionModel
 from gpmpc.mpc._rest_points import pending_inputs, rest_points
 
@@ -63,6 +63,7 @@ class Stability:
     #: whether no mode grows: integrators that nothing weighs may stand still. Of a
     #: learned model growth counts above 0.1 % a step, since its integrators are not
     #: exact ones, and above two standard deviations of what its GPs know
+    #: False where no point could be judged
     stable: bool
     #: the shortest horizon from which on no mode grows; None without any of those tried
     shortest_horizon: int | None
@@ -70,7 +71,8 @@ class Stability:
     #: range of factors of the plant's inputs around 1, tried from 0.5 to 1.5, in which
     #: no mode grows; NaN without any
     gain_range: tuple[float, float]
-    disturbance_gain: float  #: L, of the controller's estimate
+    #: L, of the controller's estimate; 1 in the form ``velocity``
+    disturbance_gain: float
     #: the controller's L where no mode grows while the plant's inputs do 0.7 to 1.3 of
     #: what the model says; where one does, four fifths of the largest L with which none
     #: does; NaN where one does without an estimate, too
@@ -88,9 +90,11 @@ class Stability:
         """What to change, a line each; none where nothing is."""
         if self.safe_disturbance_gain < self.disturbance_gain:
             what = f"disturbance_gain {self.disturbance_gain:g} is too large"
+            if self.disturbance_gain == 1.0:
+                what = f"{what} (form 'velocity' has it, too)"
             why = "the loop swings up where inputs do 0.7 or 1.3 of what the model says"
             return [f"{what}: {why}; {self.safe_disturbance_gain:.2g} is safe"]
-        if self.stable:
+        if self.stable or not self.judged:
             return []
         growth = 100.0 * (self.spectral_radius - 1.0)
         what = f"horizon {self.horizon}: the loop runs away from its reference"
@@ -116,13 +120,13 @@ def stability(
     horizon = prediction.horizon
     problem = prediction.stated_problem
     n = problem.state_dim
-    disturbance_gain = prediction.settings.disturbance_gain
+    disturbance_gain = observer_gain(prediction.settings)
     points = rest_points(prediction, followed, parameters)
     if not points:
         return Stability(
             horizon=horizon,
             spectral_radius=math.nan,
-            stable=True,
+            stable=False,
             shortest_horizon=None,
             horizons=0,
             gain_range=(math.nan, math.nan),

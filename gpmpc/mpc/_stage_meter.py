@@ -5,7 +5,10 @@ the weights of H stages, the terminal one at the end, and spreads. What is flown
 more stages than that and no end, so each is weighed here as the first one of a program.
 """
 
-from typing import Any
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,22 +16,36 @@ from gpmpc.mpc._constraints import ConstraintRows
 from gpmpc.mpc._controller import FEASIBLE
 from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._linear_quadratic import Plan
-from gpmpc.mpc._question import Question, hold_last, rows_over
+from gpmpc.mpc._question import Question, first_weight, hold_last, rows_over
 from gpmpc.mpc.problem import Problem
 
 Array = np.ndarray
 
 
+class _Horizon(NamedTuple):
+    """As many stages of a trajectory as a controller's horizon has."""
+
+    first: int  # its first stage in the trajectory
+    next_states: Array  # (H, n)
+    inputs: Array  # (H, m)
+    parameters: Any  # (H, q); None without any
+
+
 class StageMeter:
     """Costs of stages as they are paid, outputs and violated constraints included.
 
-    Weights are those of the first stage, wherever a stage stands; angles count within
-    half a turn. Constraints of a part of the horizon only do not count.
+    Weights are those of the first stage, wherever a stage stands, of outputs as well:
+    what is weighed at the end alone is left out. Angles count within half a turn.
+    Constraints of a part of the horizon only do not count.
     """
 
     def __init__(self, problem: Problem, horizon: int):
         self._problem = problem
         self._horizon = horizon
+        self._outputs = [
+            replace(output, weight=first_weight(output.weight))
+            for output in problem.outputs
+        ]
         self._rows = ConstraintRows(problem, horizon, "none")
         self._always = self._rows.applies.all(axis=0)
 
@@ -61,42 +78,80 @@ class StageMeter:
         """
         count = len(inputs)
         costs = np.zeros(count)
-        if not (self._problem.outputs or self._rows.per_stage):
+        if not (self._outputs or self._rows.per_stage):
             return costs
-        H = self._horizon
-        next_states = states[1:]
-        for first in range(0, count, H):
-            end = min(first + H, count)
-            chunk_states = hold_last(next_states[first:end], H)
-            chunk_inputs = hold_last(inputs[first:end], H)
-            chunk_parameters = None
-            if parameters is not None:
-                chunk_parameters = rows_over(parameters, first + H)[first:]
+        for stages in self._horizons(states, inputs, parameters):
+            first = stages.first
+            end = min(first + self._horizon, count)
             try:
-                chunk = self._outputs(chunk_states, chunk_inputs, chunk_parameters)
-                chunk += self._violations(chunk_states, chunk_inputs, chunk_parameters)
+                chunk = self._output_costs(stages) + self._violations(stages)
             except FunctionNotFinite:
-                chunk = np.full(H, np.inf)
+                chunk = np.full(self._horizon, np.inf)
             costs[first:end] = chunk[: end - first]
         return costs
 
-    def _outputs(self, states: Array, inputs: Array, parameters: Any) -> Array:
-        """Returns the costs of outputs at next states (H, n) and inputs (H, m)."""
-        points = np.hstack([states, inputs, np.ones((self._horizon, 1))])
-        costs = np.zeros(self._horizon)
-        for output in self._problem.outputs:
-            squares = output.squares(states, inputs, parameters)
-            costs += np.einsum("ki,kij,kj->k", points, squares, points)
-        return costs
+    def output_weights(self, states: Array, inputs: Array, parameters: Any) -> Array:
+        """Returns the weights Z (L, n + m + 1, n + m + 1) of [x_{k+1}; u_k; 1].
 
-    def _violations(self, states: Array, inputs: Array, parameters: Any) -> Array:
+        They are those of the outputs, linearised along states (L + 1, n) and inputs
+        (L, m); zero where these are not finite.
+        """
+        count = len(inputs)
+        size = states.shape[1] + inputs.shape[1] + 1
+        weights = np.zeros((count, size, size))
+        if not self._outputs:
+            return weights
+        for stages in self._horizons(states, inputs, parameters):
+            first = stages.first
+            end = min(first + self._horizon, count)
+            with suppress(FunctionNotFinite):
+                weights[first:end] = self._squares(stages)[: end - first]
+        return weights
+
+    def _horizons(
+        self, states: Array, inputs: Array, parameters: Any
+    ) -> Iterator[_Horizon]:
+        """Makes the stages of a trajectory, a horizon at a time, the last one held."""
+        H = self._horizon
+        next_states = states[1:]
+        for first in range(0, len(inputs), H):
+            own_parameters = None
+            if parameters is not None:
+                own_parameters = rows_over(parameters, first + H)[first:]
+            yield _Horizon(
+                first=first,
+                next_states=hold_last(next_states[first : first + H], H),
+                inputs=hold_last(inputs[first : first + H], H),
+                parameters=own_parameters,
+            )
+
+    def _squares(self, stages: _Horizon) -> Array:
+        """Returns the weights of all outputs (H, n + m + 1, n + m + 1)."""
+        squares: Any = 0.0
+        for output in self._outputs:
+            squares = squares + output.squares(
+                stages.next_states, stages.inputs, stages.parameters
+            )
+        return squares
+
+    def _output_costs(self, stages: _Horizon) -> Array:
+        """Returns the costs of outputs (H,)."""
+        if not self._outputs:
+            return np.zeros(self._horizon)
+        ones = np.ones((self._horizon, 1))
+        points = np.hstack([stages.next_states, stages.inputs, ones])
+        return np.einsum("ki,kij,kj->k", points, self._squares(stages), points)
+
+    def _violations(self, stages: _Horizon) -> Array:
         """Returns the prices of violated constraints (H,), infinite of hard ones."""
         if not self._rows.per_stage:
             return np.zeros(self._horizon)
+        states = stages.next_states
+        inputs = stages.inputs
         n = states.shape[1]
         certain = np.zeros((self._horizon + 1, n, n))
         plan = Plan(np.vstack([states[:1], states]), inputs, certain)
-        rows = self._rows.at(plan, certain, 1, parameters)
+        rows = self._rows.at(plan, certain, 1, stages.parameters)
         E = np.broadcast_to(rows.E, (self._horizon, *rows.E.shape[1:]))
         values = np.einsum("kri,ki->kr", E, states)
         if len(rows.D):

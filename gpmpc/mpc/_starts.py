@@ -30,7 +30,7 @@ from gpmpc.mpc._controller import (
     Reference,
     check_arguments,
 )
-from gpmpc.mpc._foresight import Flight, Foresight, Trajectory
+from gpmpc.mpc._foresight import Flight, Foresight, Trajectory, finite_costs
 from gpmpc.mpc._linear_quadratic import References, evaluate_cost
 from gpmpc.mpc._linearization import StageCosts, StageLinearizer
 from gpmpc.mpc._question import Question
@@ -72,7 +72,11 @@ class _Situation(NamedTuple):
 
 
 class _Memory(NamedTuple):
-    """What a decision on the way to a set point leaves for the next one."""
+    """What a decision on the way to a set point leaves for the next one.
+
+    What is compared later leaves out stages beyond a hard bound, whose costs are
+    infinite.
+    """
 
     goal: Array  # the set point (n,)
     promised: float  # cost of the whole flight when it was found, or of one before
@@ -86,12 +90,12 @@ class _Memory(NamedTuple):
     @classmethod
     def of_plan(cls, goal: Array, costs: Array) -> "_Memory":
         """Returns that of the controller's own plan to a set point."""
-        cost = float(costs.sum())
+        cost = float(finite_costs(costs).sum())
         return cls(
             goal=goal,
             promised=cost,
             remaining=cost,
-            dearest=float(costs.max()),
+            dearest=float(finite_costs(costs).max(initial=0.0)),
             age=0,
             costs=costs,
             flight=None,
@@ -105,8 +109,8 @@ class _Memory(NamedTuple):
 
         What a flight to the same goal promised and cost before still counts.
         """
-        promised = flight.cost
-        dearest = float(flight.costs.max())
+        promised = float(finite_costs(flight.costs).sum())
+        dearest = float(finite_costs(flight.costs).max(initial=0.0))
         if last is not None:
             promised = max(promised, last.promised)
             dearest = max(dearest, last.dearest)
@@ -127,7 +131,7 @@ class _Memory(NamedTuple):
         Costs are those of the stages (H,).
         """
         return self._replace(
-            dearest=max(self.dearest, float(costs.max())),
+            dearest=max(self.dearest, float(finite_costs(costs).max(initial=0.0))),
             age=self.age + 1,
             costs=costs,
             flight=None,
@@ -235,7 +239,7 @@ class _FlightSearch:
             improved = foresight.improve(candidate, question)
             if improved.is_better_than(best):
                 best = improved
-        return foresight.with_gains(best)
+        return foresight.with_gains(best, question)
 
 
 @explains_arguments
@@ -491,7 +495,7 @@ class ManyStarts:
             remaining = foresight.improve(
                 remaining, question, rounds=1, programs=_CORRECTIONS
             )
-            remaining = foresight.with_gains(remaining)
+            remaining = foresight.with_gains(remaining, question)
         return remaining
 
     def _is_as_promised(self, flight: Flight, memory: _Memory) -> bool:
@@ -530,7 +534,7 @@ class ManyStarts:
             return not self._foresight.arrives(costs)
         if self._foresight.arrives(costs, memory.dearest):
             return False
-        rise = costs[:-1].sum() - memory.costs[1:].sum()
+        rise = costs[:-1].sum() - finite_costs(memory.costs[1:]).sum()
         is_dearer = rise > _RISE * memory.promised
         return is_dearer or memory.age >= self._foresight.longest
 

@@ -19,6 +19,7 @@ import numpy as np
 
 from gpmpc._angles import wrap
 from gpmpc._calls import explains_arguments
+from gpmpc._dynamics import to_array
 from gpmpc.exceptions import Diverged, ShapeError, check_method, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Controller, FlightJudge, Reference
@@ -213,7 +214,8 @@ class _CascadeFlight:
         self._inputs: list[np.ndarray] = []
         self._angles = np.zeros(3)  # as they were measured last [rad]
         self._thrust: Command | None = None  # of the outer step under way
-        self._attitude: Reference | None = None  # that the inner controller follows
+        # Of the last reference of the inner controller (H + 1, 6).
+        self._attitude_states: np.ndarray | None = None
 
     def advance(self, inner_step: int) -> None:
         """Flies one inner step; the outer controller decides at each ``ratio``-th."""
@@ -221,11 +223,13 @@ class _CascadeFlight:
         time = round(inner_step * self._inner_time_step, 9)
         state = self._simulator.state
         belief = self._simulator.measure(time)
+        measured = np.array(to_array(belief.mean))
         outer_reference = self._scenario.reference_from(outer_step)
         if self._thrust is None or phase == 0:
             self._thrust = self._decide_thrust(belief, outer_reference, outer_step)
         thrust = self._thrust
-        attitude = self._attitude_reference(thrust, belief, phase)
+        attitude = self._attitude_reference(thrust, measured, phase)
+        attitude_states = np.array(attitude.states)  # recorded
         moments = self._decide_moments(belief, attitude, inner_step)
         decided_input = np.append(thrust.input[:1], moments.input)
         (result,) = step_together([self._simulator], time, [decided_input])
@@ -234,19 +238,19 @@ class _CascadeFlight:
         if phase == 0:
             self._outer.add(
                 state=state,
-                belief=belief,
+                measured=measured,
                 command=thrust,
                 input=thrust.input,
-                reference=outer_reference.states,
+                reference=self._scenario.reference_states_from(outer_step),
             )
         self._inner.add(
             state=state,
-            belief=belief,
+            measured=measured,
             command=moments,
             input=result.input[1:],
-            reference=attitude.states,
+            reference=attitude_states,
         )
-        self._attitude = attitude
+        self._attitude_states = attitude_states
         self._states.append(self._simulator.mean)
         self._inputs.append(result.input)
 
@@ -277,12 +281,12 @@ class _CascadeFlight:
         )
 
     def _attitude_reference(
-        self, thrust: Command, belief: Gaussian, phase: int
+        self, thrust: Command, measured: np.ndarray, phase: int
     ) -> Reference:
         """Returns what the inner controller is to follow under an outer command."""
-        measured = belief.mean.numpy()[6::2]
-        if np.isfinite(measured).all():
-            self._angles = measured
+        angles = measured[6::2]
+        if np.isfinite(angles).all():
+            self._angles = angles
         planned = thrust.input[None]
         if thrust.plan is not None:
             planned = thrust.plan.inputs
@@ -290,13 +294,13 @@ class _CascadeFlight:
 
     def rollout(self) -> CascadeRollout:
         """Returns what was flown."""
-        assert self._attitude is not None
+        assert self._attitude_states is not None
         outer_end = self._scenario.reference_state(len(self._outer.steps))
         return CascadeRollout(
             states=np.array(self._states),
             inputs=np.array(self._inputs),
             outer=self._outer.rollout(outer_end),
-            inner=self._inner.rollout(self._attitude.states[1]),
+            inner=self._inner.rollout(self._attitude_states[1]),
         )
 
 

@@ -3,6 +3,11 @@
 A disturbance says, step by step, which plant really acts and what is really measured.
 Times are those at which a step begins: a window that opens within a step acts from the
 next one on.
+
+To add one: a subclass of ``_Window``, or of ``Disturbance`` where it has no window;
+named in ``gpmpc.simulation`` and, for files of settings, in ``gpmpc._trust``. What acts
+on the *input* has no method yet: it would be called in ``PlantSimulator._noisy_input``,
+which would have to be told the time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,6 +22,8 @@ import numpy as np
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel, check_number
 from gpmpc.systems import System
+
+_ROUNDING = 1e-9  # [s], to which a loop rounds its times
 
 
 class Disturbance(Protocol):
@@ -50,8 +57,8 @@ class _Window(Disturbance):
             check_number("stop", self.stop, above=self.start, unit="[s]")
 
     def acts(self, time: float) -> bool:
-        """Whether it acts in the step from a time [s] on."""
-        return self.start <= time < self.stop
+        """Whether it acts in the step from a time [s] on, but for rounding."""
+        return self.start - _ROUNDING <= time < self.stop - _ROUNDING
 
 
 @explains_arguments
@@ -103,6 +110,9 @@ class Gust(_Window):
 @dataclass(frozen=True)
 class Replaced(_Window):
     """Another plant over a time window: another mass, a broken arm.
+
+    It takes the place of all that acts by then: gusts, and what else changes the plant,
+    are to stand after it in the list of disturbances.
 
     >>> from gpmpc.systems import pendulum
     >>> heavier = Replaced(pendulum(mass=1.5), start=2.0)

@@ -7,7 +7,6 @@ import numpy as np
 
 from gpmpc._angles import state_difference
 from gpmpc.exceptions import Diverged, SolverFailure
-from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import FlightJudge, Judgement, Timing
 from gpmpc.mpc._policy import Command
 from gpmpc.simulation._rollout import Rollout
@@ -94,7 +93,7 @@ class Flight:
     def add(
         self,
         state: SystemState,
-        belief: Gaussian,
+        measured: Array,
         command: Command,
         input: Array,
         reference: Array,
@@ -103,13 +102,13 @@ class Flight:
 
         Args:
             state: Of the whole simulator, when the step began.
-            belief: What was measured of it.
+            measured: What was measured of it (N,), of all the simulator's states.
             command: What was decided on it.
             input: What was applied in the end (m,).
             reference: The reference states from this step on (H + 1, n).
         """
         own_state = state.part(self._own_states)
-        measured = belief.mean.cpu().numpy().astype(float)[self._own_states]
+        measured = measured[self._own_states]
         decision = command.decision
         learned = None if decision is None else decision.learned
         # Measured here, outside of what is timed, for the judge to see.

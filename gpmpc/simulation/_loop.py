@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpmpc._calls import explains_arguments
+from gpmpc._dynamics import to_array
 from gpmpc.exceptions import (
     Diverged,
     GpmpcError,
@@ -22,9 +23,9 @@ from gpmpc.exceptions import (
     SolverFailure,
     check_number,
 )
-from gpmpc.gaussian import Gaussian
 from gpmpc.models._past import weighed_signals
 from gpmpc.mpc import Controller, Reference
+from gpmpc.mpc._controller import read_reference
 from gpmpc.mpc._policy import Command, OnFailure, decide_many
 from gpmpc.signals import Signals, signals_of
 from gpmpc.simulation._disturbances import Disturbance
@@ -217,19 +218,23 @@ def rehearse(
     """Flies the first two steps, without noise, and forgets them.
 
     A flight's times then hold no compiling and loading. There are two, since the second
-    one starts from a plan. What fails here fails again in the flight, and is raised
-    there.
+    one starts from a plan, or one where the references are of no more. What fails here
+    is left to the flight to raise.
 
     See Also:
         ``closed_loop``; ``gpmpc.mpc.ControlLoop.warm_up``, without a plant.
     """
     with suppress(GpmpcError):
+        states = read_reference(references).states
+        steps = 2
+        if np.ndim(states) == 2:
+            steps = min(steps, max(1, len(states) - controller.horizon))
         closed_loop(
             system,
             controller,
             references,
             initial,
-            steps=2,
+            steps,
             on_failure="previous_plan",
         )
 
@@ -239,7 +244,7 @@ class _DecidedStep(NamedTuple):
 
     flight: Flight
     state: SystemState
-    belief: Gaussian
+    measured: Array  # (n,)
     command: Command
 
 
@@ -253,8 +258,7 @@ def _fly_together(flights: Sequence[Flight], scenario: Scenario) -> None:
         if not flying:
             return
         time = round(k * scenario.system.time_step, 9)
-        reference = scenario.reference_from(k)
-        decided = _decide_step(flying, scenario, reference, k, time)
+        decided = _decide_step(flying, scenario, k, time)
         results = step_together(
             [step.flight.simulator for step in decided],
             time,
@@ -266,37 +270,38 @@ def _fly_together(flights: Sequence[Flight], scenario: Scenario) -> None:
                 continue
             step.flight.add(
                 state=step.state,
-                belief=step.belief,
+                measured=step.measured,
                 command=step.command,
                 input=result.input,
-                reference=reference.states,
+                reference=scenario.reference_states_from(k),
             )
 
 
 def _decide_step(
     flights: Sequence[Flight],
     scenario: Scenario,
-    reference: Reference,
     k: int,
     time: float,
 ) -> list[_DecidedStep]:
     """Measures and decides for step k of flights; those that fail end here."""
     beliefs = [flight.simulator.measure(time) for flight in flights]
+    # What is recorded is no array that a controller may calculate in.
+    measurements = [np.array(to_array(belief.mean)) for belief in beliefs]
     commands = decide_many(
         scenario.controller,
         beliefs,
-        reference,
+        scenario.reference_from(k),
         last=[flight.last for flight in flights],
         on_failure=scenario.on_failure,
         step=k,
     )
     decided = []
-    for flight, belief, command in zip(flights, beliefs, commands, strict=True):
+    for flight, measured, command in zip(flights, measurements, commands, strict=True):
         if isinstance(command, SolverFailure):
             flight.error = command
         else:
             state = flight.simulator.state
-            decided.append(_DecidedStep(flight, state, belief, command))
+            decided.append(_DecidedStep(flight, state, measured, command))
     return decided
 
 

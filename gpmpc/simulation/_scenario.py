@@ -67,15 +67,24 @@ class Scenario:
         object.__setattr__(self, "path", _path_over(reference, self.steps, horizon))
 
     def reference_from(self, k: int) -> Reference:
-        """Returns what the controller is to follow over its horizon from step k on."""
+        """Returns what the controller is to follow over its horizon from step k on.
+
+        Its arrays are copies: what a controller does to them, the path does not see.
+        """
         end = k + self.controller.horizon
         inputs = self.path.inputs
         if inputs is not None:
-            inputs = inputs[k:end]
+            inputs = np.array(inputs[k:end])
         kappas = self.stage_kappas
         if self.path.kappas is not None:
             kappas = self.path.kappas[k:end]
-        return Reference(self.path.states[k : end + 1], inputs, kappas)
+        if kappas is not None:
+            kappas = np.array(kappas)
+        return Reference(np.array(self.reference_states_from(k)), inputs, kappas)
+
+    def reference_states_from(self, k: int) -> Array:
+        """Returns the states (H + 1, n) of the path from step k on."""
+        return self.path.states[k : k + self.controller.horizon + 1]
 
     def reference_state(self, k: int) -> Array:
         """Returns r[k] (n,), or the last one where no r[k] was given."""

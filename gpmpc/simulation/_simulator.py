@@ -26,7 +26,7 @@ from gpmpc.exceptions import (
     check_numbers,
 )
 from gpmpc.gaussian import Gaussian
-from gpmpc.models._past import belief_of_all, has_past, measured_dim
+from gpmpc.models._past import belief_of_all, first_signals, has_past, measured_dim
 from gpmpc.propagation import Propagator
 from gpmpc.signals import Signals, signals_of
 from gpmpc.simulation._disturbances import Disturbance
@@ -150,7 +150,8 @@ class PlantSimulator:
             )
         self.plant = plant
         for disturbance in disturbances:
-            check_method("disturbances", disturbance, "disturb_plant", "Gust(...)")
+            for method in ("disturb_plant", "disturb_measurement"):
+                check_method("disturbances", disturbance, method, "Gust(...)")
         self.disturbances = disturbances
         self.noise = _read_noise(noise or Noise(), plant)
         self._steps = 0
@@ -197,9 +198,10 @@ class PlantSimulator:
     def measure(self, time: float) -> Gaussian:
         """Returns a measurement of the state at a time [s].
 
-        It is taken for certain: controllers of this package filter nothing.
+        It is taken for certain: controllers of this package filter nothing. What
+        disturbances and controllers do to its array does nothing to the state.
         """
-        measured = self._add_noise("measurement", self.mean)
+        measured = self._add_noise("measurement", self.mean.copy())
         for disturbance in self.disturbances:
             measured = disturbance.disturb_measurement(measured, time)
         return Gaussian.certain(measured)
@@ -218,7 +220,7 @@ class PlantSimulator:
             raise ShapeError(
                 f"the plant takes inputs of shape {shape}; got {np.shape(input)}"
             )
-        return self._add_noise("input", input)
+        return self._add_noise("input", np.array(input, dtype=float))
 
     def _move_to(self, state: Array, input: Array) -> Diverged | None:
         """Moves to the next state (n,), with noise.
@@ -297,16 +299,16 @@ class ModelSimulator:
         self._steps = 0
         model = loop.model
         options: Any = {"device": model.device, "dtype": model.dtype}
-        names = signals_of(model).state_names
-        mean = initial
+        mean = initial.mean if isinstance(initial, Gaussian) else initial
+        n = model.state_dim
+        if _is_as_long(mean, measured_dim(model)):
+            n = measured_dim(model)
+        names = first_signals(signals_of(model), n).state_names
         covariance = None
         if isinstance(initial, Gaussian):
             belief = initial.in_order(names)
             mean = belief.mean
             covariance = belief.covariance
-        n = model.state_dim
-        if _is_as_long(mean, measured_dim(model)):
-            n = measured_dim(model)
         if covariance is None:
             covariance = _INITIAL_DEVIATION**2 * torch.eye(n, **options)
         mean = torch.as_tensor(_check_state(mean, n, names), **options)
@@ -341,12 +343,10 @@ class ModelSimulator:
         return angles_of(self.loop.model)
 
     def measure(self, time: float) -> Gaussian:
-        """Returns the belief over what is measured."""
+        """Returns the belief over what is measured, as tensors of its own."""
         n = self._measured_dim
         belief = self._belief
-        if len(belief.mean) == n:
-            return belief
-        return Gaussian(belief.mean[:n], belief.covariance[:n, :n])
+        return Gaussian(belief.mean[:n].clone(), belief.covariance[:n, :n].clone())
 
     def step(self, input: Array) -> Diverged | None:
         """Carries the belief one step on; returns why it cannot go on, if so."""
@@ -398,7 +398,9 @@ def step_together(
     plant = simulators[0]._disturbed_plant(time)
     with np.errstate(over="ignore", invalid="ignore"):
         if len(simulators) == 1:
-            next_states: Any = [step(plant, simulators[0].mean, noisy_inputs[0])]
+            # Copies: equations may calculate in place.
+            state = simulators[0].mean.copy()
+            next_states: Any = [step(plant, state, noisy_inputs[0].copy())]
         else:
             states = np.array([simulator.mean for simulator in simulators])
             next_states = step_many(plant, states, np.array(noisy_inputs))

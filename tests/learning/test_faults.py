@@ -338,3 +338,63 @@ def test_a_decision_that_fails_is_taken_without_the_change(monkeypatch):
     assert decision.applicable
     assert not decision.learned.active
     assert decision.learned.size == len(MODEL)
+
+
+@pytest.mark.parametrize("invalid", [1e200, np.finfo(float).max, np.inf])
+def test_an_absurd_measurement_ends_no_flight(invalid):
+    def marked(random):
+        sensor = Sensor()
+        sensor.offset[50, 0] = invalid
+        return sensor
+
+    with np.errstate(all="raise"):
+        errors, decisions = flown(OnlineLearning(), marked, WIND)
+    assert np.abs(errors[70:]).max() < 0.1
+    assert decisions[-1].learned.doubt is None
+    assert decisions[-1].learned.active
+
+
+def test_steps_without_a_measurement_count_as_time():
+    loop = ControlLoop(controller_of(OnlineLearning()))
+    for k in range(20):
+        loop.input([NAN, NAN] if 5 <= k < 15 else [0.0, 0.01 * k], np.zeros(2))
+    assert loop.last.plan.learned.model.time == 19.0
+
+
+def test_what_a_failed_decision_was_taught_is_not_lost():
+    class Failing(GPMPC):
+        fails = False
+
+        def control(self, *arguments, **options):
+            decision = super().control(*arguments, **options)
+            if not self.fails:
+                return decision
+            return replace(decision, status=Status.INFEASIBLE, suboptimal=False)
+
+    plain = Failing(MODEL, Linearization(), PROBLEM, HORIZON, [0.0])
+    loop = ControlLoop(LearningController(plain, OnlineLearning()))
+    for k in range(8):
+        plain.fails = k == 6
+        loop.input([0.0, 0.01 * k], np.zeros(2))
+        learned = loop.last.plan.learned
+        assert learned.state.tolist() == [0.0, 0.01 * k]
+        assert learned.model.time == k
+
+
+def test_feedback_between_plans_is_that_of_the_controller():
+    inputs = []
+    for learning in (None, OnlineLearning()):
+        loop = ControlLoop(controller_of(learning))
+        loop.input(np.zeros(2), np.array([0.1, 0.0]))
+        inputs.append(loop.input_between([0.05, 0.0], 0.5))
+    assert inputs[0] == inputs[1]
+    assert inputs[0] != loop.input_between([0.06, 0.0], 0.5)
+
+
+def test_a_first_plan_is_handed_on():
+    plan = 0.1 * np.ones((HORIZON, 1))
+    inputs = [
+        ControlLoop(controller_of(learning)).input(np.ones(2), np.zeros(2), plan=plan)
+        for learning in (None, OnlineLearning())
+    ]
+    assert inputs[0] == inputs[1]

@@ -4,6 +4,7 @@ import pytest
 from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.models import KnownModel
 from gpmpc.mpc import GPMPC, Box, ControlLoop, Problem, Reference, Tracking
+from gpmpc.mpc.baselines import LQR
 from gpmpc.propagation import Linearization
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
 from gpmpc.simulation import closed_loop
@@ -103,3 +104,10 @@ def test_a_late_decision_goes_on_along_the_plan_within_rates():
     assert loop.input_between(plan.means[2], 2.0) == pytest.approx([0.3])
     behind = loop.input_between(plan.means[2] - 1.0, 2.0)
     assert behind == pytest.approx([0.3])  # by its rate, from the planned one before
+
+
+def test_a_controller_that_takes_no_plan_says_so():
+    loop = ControlLoop(LQR(model(), PROBLEM, 10, [0.0]))
+    for key in ("plan", "parameters"):
+        with pytest.raises(SettingError, match=f"{key}: is nothing that LQR.control"):
+            loop.input(np.zeros(2), GOAL, **{key: np.zeros((10, 1))})

@@ -186,3 +186,28 @@ def test_a_search_under_constraints_with_parameters_keeps_them():
         path.append(state)
     assert np.abs(np.array(path)[:, 0]).max() < 0.52
     assert np.abs(wrap(np.array(path)[-10:, 2])).max() < 0.2
+
+
+def test_a_stage_beyond_a_hard_bound_says_nothing_of_arrival():
+    foresight = Foresight(controller(pendulum(), pendulum_problem(), 20))
+    stuck = np.full(20, 5.0)
+    stuck[3] = np.inf
+    assert not foresight.arrives(stuck)
+    held = np.append(stuck, np.zeros(20))
+    assert foresight.arrives(held)
+    assert not foresight.arrives(np.append(held, np.inf))
+
+
+def test_feedback_of_a_flight_weighs_outputs_as_it_weighs_states():
+    weight = [1.0, 0.1]
+    output = LeastSquares(lambda x: x, weight=weight)
+    gains = []
+    for states_weight, outputs in ((weight, []), ([0.0, 0.0], [output])):
+        cost = Tracking(states_weight, [0.01], penalized="inputs", angles=(0,))
+        problem = Problem(cost, inputs=Box([-2.0], [2.0]), outputs=outputs)
+        foresight = Foresight(controller(pendulum(), problem, 10))
+        flight = Flight(np.zeros((13, 2)), np.zeros((12, 1)), np.zeros(12), True)
+        asked = question(Reference(np.zeros(2)).over(10))
+        gains.append(foresight.with_gains(flight, asked).gains)
+    assert np.abs(gains[0]).min() > 0.1
+    assert np.allclose(gains[0], gains[1])

@@ -392,3 +392,66 @@ def test_arrays_of_other_sizes_are_refused():
     for reference in (np.zeros(1), np.zeros((4, 3)), np.zeros((0, 2))):
         with pytest.raises(ShapeError, match="reference must be"):
             judge.judge(state, reference, None)
+
+
+@pytest.mark.parametrize("absurd", [np.inf, 1e200])
+def test_an_absurd_measurement_does_not_blind_the_judge(absurd):
+    judge = FlightJudge(CONTROLLER.problem)
+    rng = np.random.default_rng(0)
+    for k in range(40):
+        measured = rng.normal(0.0, 1e-3, 2)
+        if k == 12:
+            measured[0] = absurd
+        if k > 30:
+            measured[0] += 0.05
+        judgement = judge.judge(measured, np.zeros(2), plan_of(np.zeros(2)))
+        assert k > 30 or judgement == Judgement()
+    assert judgement.reason.startswith("innovations of state 0")
+
+
+def test_an_absurd_first_measurement_hides_no_distance():
+    class Absent(Disturbance):
+        def disturb_measurement(self, state, time):
+            return state if time else np.full(2, np.inf)
+
+    assert fly(Absent(), Reversed(0, 40 * T), steps=120).judgement.level == "lost"
+
+
+@pytest.mark.parametrize("missing", [1, 2])
+def test_a_first_step_without_a_plan_promised_nothing(missing):
+    judge = FlightJudge(CONTROLLER.problem)
+    way = np.zeros((60, 2))
+    way[:, 0] = 10.0 - 0.04 * np.arange(60)
+    way[:, 1] = 0.01 * (np.arange(60) % 2)
+    for k in range(40):
+        no_plan = plan_of(np.zeros(2), status=Status.INVALID_MEASUREMENT)
+        measured = np.full(2, np.nan) if k < missing else way[k]
+        means = way[k : k + 11]
+        covariances = np.zeros((11, 2, 2))
+        plan = replace(plan_of(np.zeros(2)), means=means, covariances=covariances)
+        judgement = judge.judge(measured, np.zeros(2), no_plan if k < missing else plan)
+        assert judgement == Judgement()
+
+
+def test_plans_that_climb_after_a_first_dropout_are_lost():
+    rollout = tank(10, disturbances=[Dropout(0.0, 10.0)])
+    assert np.isnan(rollout.measured[:2]).all()
+    assert "the horizon is too short for the plant" in rollout.judgement.reason
+
+
+def test_failed_decisions_count_where_no_state_is_weighed():
+    judge = FlightJudge(Problem(Tracking([0.0, 0.0], [1.0])))
+    failed = plan_of(np.full(2, np.nan), status=Status.INFEASIBLE)
+    for _ in range(8):
+        judgement = judge.judge(np.zeros(2), np.zeros(2), failed)
+    assert judgement.reason == "8 of the last 8 decisions could not be applied"
+
+
+def test_a_state_that_is_to_stay_is_not_frozen():
+    judge = FlightJudge(CONTROLLER.problem)
+    for k in range(30):
+        measured = np.array([0.1 * k, 0.0])
+        means = measured + np.outer(np.arange(6), [0.1, 0.0])
+        plan = replace(plan_of(measured), means=means)
+        judgement = judge.judge(measured, np.zeros(2), plan)
+        assert "is measured the same" not in judgement.reason

@@ -260,3 +260,18 @@ def test_the_gain_of_a_long_horizon_is_stationary_and_exists(rng):
         2 * np.eye(4)[None], np.zeros((1, 4, 2)), Q[None], R[None], Q, 20
     )
     assert np.array_equal(unreachable, np.zeros((20, 2, 4)))
+
+
+@pytest.mark.parametrize(
+    ("Q", "R", "message"),
+    [
+        (0.0, 1.0, "Q does not weigh a growing mode"),
+        (-1.0, 1.0, "Q: must be positive semidefinite"),
+        (1.0, 0.0, "R: must be positive definite"),
+    ],
+)
+def test_a_stationary_gain_says_what_it_lacks(Q, R, message):
+    with pytest.raises(SettingError, match=message):
+        dlqr(np.array([[1.2]]), np.eye(1), Q * np.eye(1), R * np.eye(1))
+    with pytest.raises(SettingError, match="the inputs do not reach a growing mode"):
+        dlqr(np.array([[1.2]]), np.zeros((1, 1)), np.eye(1), np.eye(1))

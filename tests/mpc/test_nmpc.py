@@ -153,7 +153,8 @@ def test_soft_state_bounds_give_way_where_they_must():
     )
     fast = Gaussian.certain(np.array([0.0, 0.5]))
     decision = NMPC(plant, problem, 5, [0.0]).control(fast, Reference(np.zeros((6, 2))))
-    assert decision.status is Status.SOLVED
+    assert decision.status is Status.SOFT_BOUND_MISSED
+    assert decision.violation == pytest.approx(0.1, abs=1e-6)
     assert np.allclose(decision.means[1:3, 1], [0.4, 0.3], atol=1e-6)
     assert decision.means[2:, 1].max() < 0.3 + 1e-6
 
@@ -293,7 +294,9 @@ def test_a_soft_state_bound_costs_what_it_says_on_either_side(price):
         decision = controller.control(
             Gaussian.certain(np.array([start])), Reference(np.full((2, 1), target))
         )
-        assert decision.status is Status.SOLVED
+        is_missed = decision.violation > 1e-5
+        assert (decision.status is Status.SOFT_BOUND_MISSED) == is_missed
+        assert decision.status.solved
         assert decision.means[1, 0] == pytest.approx(best, abs=2e-5)
 
 
@@ -349,3 +352,17 @@ def test_the_last_state_has_its_weight_and_inputs_theirs(penalized, rng):
             changed = decision.inputs.copy()
             changed[k] += change
             assert cost(changed) > best
+
+
+def test_references_without_a_use_are_refused():
+    plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
+    still = Gaussian.certain(np.zeros(2))
+    cost = Tracking([1.0, 0.0], [1e-3], penalized="deviations")
+    deviating = NMPC(plant, Problem(cost), 2, [0.0])
+    with pytest.raises(ShapeError, match=r"needs reference inputs \(2, 1\); got none"):
+        deviating.control(still, Reference(np.zeros((3, 2))))
+    cost = Tracking([1.0, 0.0], [1e-3])
+    with pytest.raises(SettingError, match="kappas: are for .* NMPC predicts none"):
+        NMPC(plant, Problem(cost), 2, [0.0]).control(
+            still, Reference(np.zeros((3, 2)), kappas=np.ones(2))
+        )

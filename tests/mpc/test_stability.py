@@ -187,6 +187,20 @@ def test_too_quick_an_estimate_for_a_delay_is_named():
         assert circling < 0.05
 
 
+def test_form_velocity_is_judged_as_the_quickest_estimate():
+    model = DelayedModel(INTEGRATOR, LATE)
+    weights = Tracking([1.0] + [0.0] * LATE, [1e-4])
+    goal = np.zeros(1 + LATE)
+    held, estimated = (
+        loop_of(model, weights, 20, [0.0], **settings).stability(goal)
+        for settings in ({"form": "velocity"}, {"disturbance_gain": 1.0})
+    )
+    assert held.disturbance_gain == 1.0
+    assert held.spectral_radius == pytest.approx(estimated.spectral_radius, abs=1e-6)
+    assert held.safe_disturbance_gain == estimated.safe_disturbance_gain < 1.0
+    assert held.warnings == estimated.warnings != []
+
+
 def test_plants_settle_exactly_within_the_range_of_gains():
     controller = late_integrator(0.7)
     low, high = controller.stability(np.zeros(1 + LATE)).gain_range
@@ -266,6 +280,7 @@ def test_a_reference_at_which_nothing_can_rest_is_not_judged():
     bounded = loop_of(stable, Tracking([1.0], [0.1]), 5, [0.0], bounds=Box([-1], [1]))
     stability = bounded.stability([10.0])  # it would take an input of 5
     assert not stability.judged
+    assert not stability.stable
     assert np.isnan(stability.spectral_radius)
     assert not stability.warnings
     assert bounded.stability([1.0]).judged

@@ -1,5 +1,7 @@
 """Trials flown together are the trials flown alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -17,6 +19,7 @@ from gpmpc.mpc import (
     Timing,
     Tracking,
 )
+from gpmpc.mpc._policy import decide_many
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, closed_loop, closed_loops
 from gpmpc.status import Status
@@ -296,3 +299,20 @@ def test_flights_with_the_model_on_a_gpu_are_those_on_the_cpu(covariance, propag
     there = controller(covariance, propagator, GP.to("cuda"))
     for ours, theirs in zip(fly(there), fly(here), strict=True):
         assert_same(ours.result, theirs.result)
+
+
+class Doubling(GPMPC):
+    """Overrides ``control`` alone."""
+
+    def control(self, *arguments, **options):
+        decision = super().control(*arguments, **options)
+        return replace(decision, disturbance=np.full(6, 7.0))
+
+
+def test_a_control_that_is_overridden_alone_decides_for_many():
+    problem = Problem(Tracking([1.0] * 6, [0.1] * 3))
+    controller = Doubling(GP, Linearization(), problem, H, HOVER)
+    beliefs = [Gaussian.certain(START), Gaussian.certain(-START)]
+    reference = Reference(np.zeros((H + 1, 6)))
+    commands = decide_many(controller, beliefs, reference, [None, None])
+    assert [command.decision.disturbance[0] for command in commands] == [7.0, 7.0]

@@ -9,7 +9,15 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.mpc import Decision, Reference, Timing
 from gpmpc.propagation import MomentMatching
-from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, Replaced, closed_loop
+from gpmpc.simulation import (
+    Dropout,
+    Gust,
+    ModelLoop,
+    Noise,
+    Replaced,
+    closed_loop,
+    rehearse,
+)
 from gpmpc.status import Status
 from gpmpc.systems import Map, System, Translational, step
 
@@ -443,3 +451,72 @@ def test_nothing_disturbs_a_model_loop(model):
             SettingError, match="need a plant in the loop; got a ModelLoop"
         ):
             fly(plant=ModelLoop(model, MomentMatching()), **settings)
+
+
+@pytest.mark.parametrize("rate", [10, 30, 60, 100])
+def test_a_window_opens_and_closes_at_its_step(rate):
+    period = 1 / rate
+    for k in range(1, 200):
+        gust = Gust({"v": 1.0}, start=k * period, stop=(k + 1) * period)
+        times = [round(i * period, 9) for i in (k - 1, k, k + 1)]
+        assert [gust.acts(time) for time in times] == [False, True, False]
+
+
+class InPlace(Feedback):
+    """Calculates in the arrays that it is handed, as its sensor and its plant do."""
+
+    def control(self, belief, reference, previous=None):
+        decision = super().control(belief, reference, previous)
+        belief.mean.numpy()[:] = np.nan
+        reference.states[:] = np.nan
+        return decision
+
+    def disturb_plant(self, plant, time):
+        return plant
+
+    def disturb_measurement(self, state, time):
+        state += 0.1
+        return state
+
+
+class InPlaceCart(Cart):
+    def successor(self, x, u):
+        x[0] += 0.1 * x[1]
+        x[1] += 0.1 * u[0]
+        return x
+
+
+def test_what_is_handed_out_is_no_part_of_the_plant_or_the_record():
+    plant = System(InPlaceCart(), time_step=0.1, substeps=1)
+    careless = InPlace()
+    flight = fly(controller=careless, plant=plant, disturbances=[careless])
+    assert np.allclose(flight.measured, flight.states[:-1] + 0.1)
+    assert np.array_equal(flight.references, np.zeros((31, 2)))
+    x, v = flight.states.T
+    assert np.allclose(np.diff(x), 0.1 * v[:-1])
+    assert np.allclose(np.diff(v), 0.1 * flight.inputs[:, 0])
+    assert not REFERENCES.any()
+
+
+def test_a_model_loop_keeps_its_belief_to_itself(model):
+    loop = ModelLoop(model, MomentMatching())
+    careful = fly(controller=Feedback(), plant=loop, steps=3)
+    careless = fly(controller=InPlace(), plant=loop, steps=3)
+    assert np.array_equal(careful.states, careless.states)
+
+
+def test_a_disturbance_without_a_method_is_refused():
+    class Half:
+        def disturb_plant(self, plant, time):
+            return plant
+
+    with pytest.raises(SettingError, match="the method 'disturb_measurement'"):
+        fly(disturbances=[Half()])
+
+
+def test_one_step_is_rehearsed_where_references_end():
+    controller = Feedback()
+    rehearse(PLANT, controller, Reference(np.zeros((4, 2))), START)
+    assert len(controller.seen) == 1
+    rehearse(PLANT, controller, Reference(np.zeros((5, 2))), START)
+    assert len(controller.seen) == 3

@@ -146,6 +146,19 @@ def test_series_and_tables_fly_like_their_numbers_in_order(controller):
         assert np.array_equal(*ends) or isinstance(start, Gaussian)
 
 
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_model_with_a_past_starts_from_what_is_measured(model, dtype):
+    delayed = DelayedModel(model.to(dtype=dtype), 1)
+    loop = ModelLoop(delayed, Linearization())
+    controller = gp_mpc(DelayedModel(model, 1))
+    ends = [
+        fly(controller, loop, initial=start).states
+        for start in (NUMBERS, START, Gaussian.certain(START))
+    ]
+    assert np.array_equal(ends[0], ends[1])
+    assert np.array_equal(ends[0][0], ends[2][0])
+
+
 def test_a_controller_sorts_a_series_by_the_names_of_its_model(model, controller):
     for steering in (
         controller,

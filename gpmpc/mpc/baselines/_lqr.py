@@ -86,7 +86,7 @@ class LQR:
     ) -> Decision:
         """Returns the clipped linear-quadratic plan; see ``Controller.control``.
 
-        Covariances are not predicted.
+        Covariances are not predicted: kappas of a reference raise ``SettingError``.
         """
         start = perf_counter()
         request = Request.read(
@@ -98,6 +98,7 @@ class LQR:
             previous,
             signals=self.signals,
         )
+        request.refuse_kappas("LQR")
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         references = request.references

@@ -28,6 +28,7 @@ from gpmpc.gp.casadi_ import successor_function
 from gpmpc.mpc._constraints import ConstraintRows
 from gpmpc.mpc._controller import (
     FEASIBLE,
+    KEPT,
     Decision,
     Reference,
     Request,
@@ -95,7 +96,10 @@ class NMPC:
     def control(
         self, belief: Gaussian, reference: Reference, previous: Decision | None = None
     ) -> Decision:
-        """Solves the problem from the belief's mean; see ``Controller.control``."""
+        """Solves the problem from the belief's mean; see ``Controller.control``.
+
+        Covariances are not predicted: kappas of a reference raise ``SettingError``.
+        """
         n = self.problem.state_dim
         m = self.problem.input_dim
         H = self.horizon
@@ -109,6 +113,7 @@ class NMPC:
             previous,
             signals=self.signals,
         )
+        request.refuse_kappas("NMPC")
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         parameters = _parameters(request)
@@ -118,8 +123,9 @@ class NMPC:
         means = np.vstack([request.state, unknowns[: H * n].reshape(H, n)])
         inputs = unknowns[H * n : H * (n + m)].reshape(H, m)
         status = solution.status
-        violation = solution.violation
         stopped = status not in (Status.SOLVED, Status.INFEASIBLE)
+        if status is Status.SOLVED and solution.soft_violation > KEPT:
+            status = Status.SOFT_BOUND_MISSED
         return Decision(
             input=inputs[0],
             inputs=inputs,
@@ -128,8 +134,8 @@ class NMPC:
             status=status,
             iterations=solution.iterations,
             timing=Timing(solve=perf_counter() - start),
-            suboptimal=stopped and bool(violation <= FEASIBLE),
-            violation=max(0.0, float(violation)),
+            suboptimal=stopped and bool(solution.hard_violation <= FEASIBLE),
+            violation=solution.violation,
         )
 
     def _guess(self, request: Request) -> Array:
@@ -153,8 +159,9 @@ class _Bounds(NamedTuple):
     upper: Array
 
     def violation(self, values: Array) -> float:
-        """Returns the largest distance beyond a bound; below zero inside all."""
-        return np.maximum(self.lower - values, values - self.upper).max()
+        """Returns the largest distance beyond a bound; 0 inside all, NaN of a NaN."""
+        excess = np.maximum(self.lower - values, values - self.upper)
+        return float(excess.max(initial=0.0))
 
 
 class _Solution(NamedTuple):
@@ -163,7 +170,13 @@ class _Solution(NamedTuple):
     unknowns: Array  # x_1 .. x_H, u_0 .. u_{H-1} and slacks
     status: Status
     iterations: int
-    violation: float  # largest one of bounds and constraints; below zero inside all
+    hard_violation: float  # largest one of what has no slack; NaN where it is unknown
+    soft_violation: float  # largest one of soft constraints, without their slack
+
+    @property
+    def violation(self) -> float:
+        """The largest violation, 0 inside all; NaN where it is unknown."""
+        return float(np.maximum(self.hard_violation, self.soft_violation))
 
 
 class _Program(NamedTuple):
@@ -172,6 +185,8 @@ class _Program(NamedTuple):
     solver: casadi.Function
     unknowns: _Bounds  # of x_1 .. x_H, u_0 .. u_{H-1} and slacks
     constraints: _Bounds
+    soft_rows: casadi.Function  # values of the soft rows at the unknowns
+    soft_bounds: _Bounds  # of these
 
     def solve(self, guess: Array, parameters: Array) -> _Solution:
         """Solves the program from a guess of its unknowns."""
@@ -186,7 +201,8 @@ class _Program(NamedTuple):
         stats = self.solver.stats()
         unknowns = np.array(solution["x"]).ravel()
         values = np.array(solution["g"]).ravel()
-        violations = [
+        soft_values = np.array(self.soft_rows(unknowns)).ravel()
+        hard_violations = [
             self.unknowns.violation(unknowns),
             self.constraints.violation(values),
         ]
@@ -194,7 +210,8 @@ class _Program(NamedTuple):
             unknowns=unknowns,
             status=_STATUSES.get(stats["return_status"], Status.NUMERICAL_TROUBLE),
             iterations=stats["iter_count"],
-            violation=np.max(violations),  # NaN where one is
+            hard_violation=float(np.max(hard_violations)),  # NaN where one is
+            soft_violation=self.soft_bounds.violation(soft_values),
         )
 
 
@@ -220,7 +237,7 @@ class _Entries:
     @property
     def bounds(self) -> _Bounds:
         """The bounds of all of them."""
-        lower, upper = np.hstack(self._bounds)
+        lower, upper = np.hstack([np.empty((2, 0)), *self._bounds])
         return _Bounds(lower, upper)
 
 
@@ -271,7 +288,8 @@ def _build(plant: System, problem: Problem, horizon: int, tolerance: float) -> _
     if problem.input_rates.finite:
         lower, upper = problem.input_rates.by_stage(H)
         constraints.add(increments, lower, upper)
-    cost = _constrain_states(problem, x, cost, unknowns, constraints)
+    soft = _Entries()
+    cost = _constrain_states(problem, x, cost, unknowns, constraints, soft)
 
     parameters = casadi.vertcat(
         initial_state,
@@ -286,7 +304,13 @@ def _build(plant: System, problem: Problem, horizon: int, tolerance: float) -> _
         "p": parameters,
     }
     solver = casadi.nlpsol("nmpc", "ipopt", program, _options(tolerance))
-    return _Program(solver, unknowns.bounds, constraints.bounds)
+    return _Program(
+        solver=solver,
+        unknowns=unknowns.bounds,
+        constraints=constraints.bounds,
+        soft_rows=casadi.Function("soft_rows", [unknowns.values], [soft.values]),
+        soft_bounds=soft.bounds,
+    )
 
 
 def _options(tolerance: float) -> dict[str, Any]:
@@ -321,8 +345,12 @@ def _constrain_states(
     cost: casadi.SX,
     unknowns: _Entries,
     constraints: _Entries,
+    soft_rows: _Entries,
 ) -> casadi.SX:
-    """Adds constraints of states (n, H) and their slacks; returns the whole cost."""
+    """Adds constraints of states (n, H) and their slacks; returns the whole cost.
+
+    Soft rows are added once more, without slack.
+    """
     n, H = x.shape
     rows = ConstraintRows(problem, H, "none")
     if not rows.per_stage:
@@ -331,6 +359,10 @@ def _constrain_states(
     stage_rows = rows.at(no_plan, np.empty(0), H)
     values = casadi.mtimes(casadi.DM(stage_rows.E[0]), x)
     soft = np.flatnonzero(np.isfinite(rows.prices))
+    if len(soft):
+        lower = np.broadcast_to(stage_rows.lower, (H, len(rows.prices)))
+        upper = np.broadcast_to(stage_rows.upper, (H, len(rows.prices)))
+        soft_rows.add(values[soft.tolist(), :], lower[:, soft], upper[:, soft])
     slack = casadi.SX.sym("slack", len(soft), H)
     for index, row in enumerate(soft):
         # A soft row gives way on its side.
