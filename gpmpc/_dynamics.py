@@ -198,7 +198,9 @@ def to_array(tensor: Tensor) -> Array:
 
 
 def batched_jacobian(
-    function: Callable[..., tuple[Tensor, ...]], arguments: Sequence[Tensor]
+    function: Callable[..., tuple[Tensor, ...]],
+    arguments: Sequence[Tensor],
+    function_in_graph: bool = False,
 ) -> tuple[tuple[Tensor, ...], list[Tensor]]:
     """Evaluates a function and the Jacobians of its first value.
 
@@ -208,14 +210,16 @@ def batched_jacobian(
         function: Takes the arguments, batch element by batch element; its first value
             is (*batch, k).
         arguments: (*batch, d_i) each.
+        function_in_graph: Whether the function has parameters that autograd follows.
 
     Returns:
         The values, and the Jacobians (*batch, k, d_i). All can be differentiated again
-        where an argument requires it.
+        where an argument or the function requires it.
     """
-    differentiable = torch.is_grad_enabled() and any(
+    in_graph = function_in_graph or any(
         argument.requires_grad for argument in arguments
     )
+    differentiable = torch.is_grad_enabled() and in_graph
     with torch.inference_mode(False), torch.enable_grad():
         leaves = []
         for argument in arguments:
@@ -280,8 +284,9 @@ def predict_with_jacobian(
 ) -> FirstOrderExpansion:
     """Predicts, with the derivatives of the mean.
 
-    By the model's ``linearize`` where torch follows nothing; else by its own method of
-    this name, which torch can differentiate and transform further, or by autograd.
+    By the model's ``linearize`` where torch follows nothing, neither the arguments nor
+    the model's GPs; else by its own method of this name, which torch can differentiate
+    and transform further, or by autograd.
 
     Args:
         model: Has ``predict``.
@@ -289,7 +294,8 @@ def predict_with_jacobian(
         input: (*batch, m).
     """
     arrays = constant_arrays(state, input)
-    if arrays is not None and hasattr(model, "linearize"):
+    is_constant = arrays is not None and not has_gps_in_graph(model)
+    if is_constant and hasattr(model, "linearize"):
         check_query(model, state, input)
         return _linearize_batch(model, arrays, state.shape[:-1])
     method = getattr(model, "predict_with_jacobian", None)
@@ -297,6 +303,18 @@ def predict_with_jacobian(
         return predict_by_autograd(model, state, input)
     belief, A, B = method(state, input)
     return FirstOrderExpansion(belief, A, B)
+
+
+def has_gps_in_graph(model: Any) -> bool:
+    """Whether autograd or a function transform follows the GPs of a model.
+
+    They are its own, or those of the model that it is made around.
+    """
+    weights = getattr(model, "weights", None)
+    if isinstance(weights, Tensor):
+        return constant_arrays(weights) is None
+    part = getattr(model, "_part", None)
+    return isinstance(part, TensorModel) and has_gps_in_graph(part)
 
 
 def _linearize_batch(
@@ -330,7 +348,9 @@ def predict_by_autograd(
         belief = call("model", model.predict, x, u)
         return belief.mean, belief.covariance
 
-    (mean, covariance), (A, B) = batched_jacobian(prediction, (state, input))
+    (mean, covariance), (A, B) = batched_jacobian(
+        prediction, (state, input), function_in_graph=has_gps_in_graph(model)
+    )
     return FirstOrderExpansion(Gaussian(mean, covariance), A, B)
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gpmpc.gp._transitions import Transitions, check_transitions
 from gpmpc.gp._wrapped import warn_of_turns
+from gpmpc.signals import UNKNOWN, Signals
 
 _log = logging.getLogger(__name__)
 
@@ -45,20 +46,28 @@ class Columns(NamedTuple):
         return self.deviations
 
     @classmethod
-    def numbered(
-        cls, features: Tensor, targets: Tensor, input_dim: int, predicts: str
+    def of_tensors(
+        cls,
+        features: Tensor,
+        targets: Tensor,
+        input_dim: int,
+        predicts: str,
+        signals: Signals = UNKNOWN,
     ) -> "Columns":
-        """Names states, inputs and outputs by numbers from 1.
+        """Names states and inputs as signals do, and all others by numbers from 1.
 
         Args:
             features: x~ = (x, u) (N, n + m).
             targets: (N, k).
             input_dim: m.
             predicts: What the targets mean.
+            signals: Of the data, where they are known.
         """
         output_count = targets.shape[1]
-        states = _numbered("state", features.shape[1] - input_dim)
-        inputs = _numbered("input", input_dim)
+        states = list(signals.state_names)
+        if not states:
+            states = _numbered("state", features.shape[1] - input_dim)
+        inputs = list(signals.input_names) or _numbered("input", input_dim)
         outputs = states
         if predicts == "value":
             outputs = _numbered("output", output_count)

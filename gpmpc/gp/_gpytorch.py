@@ -220,20 +220,21 @@ def _read_se_ard(exact: ExactModel) -> _SEARDModel:
 
     kernel = model.covar_module
     inducing: list[Tensor] = []
-    is_sparse = isinstance(kernel, gpytorch.kernels.InducingPointKernel)
+    is_sparse = type(kernel) is gpytorch.kernels.InducingPointKernel
     if is_sparse and kernel.active_dims is None:
         points = kernel.inducing_points.detach()
         inducing = list(points.reshape(-1, *points.shape[-2:]))
         kernel = kernel.base_kernel
     signal_variance = torch.ones((), dtype=torch.float64)
-    if isinstance(kernel, gpytorch.kernels.ScaleKernel):
+    # a derived class may compute something else, and ``active_dims`` select features
+    if type(kernel) is gpytorch.kernels.ScaleKernel and kernel.active_dims is None:
         signal_variance = kernel.outputscale
         kernel = kernel.base_kernel
     _check_se_ard(kernel)
     lengthscales = kernel.lengthscale.reshape(-1, kernel.lengthscale.shape[-1])
 
     mean = model.mean_module
-    if not isinstance(mean, gpytorch.means.ConstantMean | gpytorch.means.ZeroMean):
+    if type(mean) not in (gpytorch.means.ConstantMean, gpytorch.means.ZeroMean):
         raise UnsupportedModel(
             f"the mean must be zero or constant; got {type(mean).__name__}"
         )

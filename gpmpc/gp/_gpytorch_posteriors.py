@@ -39,7 +39,7 @@ from gpmpc.gp._tensor_checks import Predicts, check_columns
 from gpmpc.signals import UNKNOWN, Signals, signals_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KernelPosterior(TensorModel):
     """Exact GPs with any kernels of GPyTorch, frozen; build it with ``from_gpytorch``.
 
@@ -154,7 +154,7 @@ class _Prediction(NamedTuple):
     variance: Tensor  #: (B, k)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _FrozenModel:
     """A GPyTorch model with its factorisation; k is left out for a single output."""
 

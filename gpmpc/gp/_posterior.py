@@ -260,6 +260,9 @@ class GPPosterior(TensorModel):
         if self._is_round_off(diagonal - nominal):
             return self.noise_variance
         noise = diagonal.mean(-1) - self.signal_variance
+        if len(self) == 1:
+            # a pseudo-observation sums up several rows: its noise is less than theirs
+            return noise if bool((noise > self.noise_variance).all()) else None
         cross = kernel_matrix(
             self.features[1:],
             self.features[:1],
@@ -268,8 +271,7 @@ class GPPosterior(TensorModel):
         )[..., 0]
         first_column = self.cholesky[:, 1:, 0] * self.cholesky[:, :1, 0]
         is_kernel_and_noise = (
-            len(self) > 1
-            and bool((noise > 0).all())
+            bool((noise > 0).all())
             and self._is_round_off(diagonal - diagonal[:, :1])
             and self._is_round_off(first_column - cross)
         )
@@ -292,22 +294,25 @@ class GPPosterior(TensorModel):
     def to(
         self, device: str | torch.device | None = None, dtype: torch.dtype | None = None
     ) -> "GPPosterior":
-        """Copies the posterior to another device or type, float32 or float64."""
+        """Moves the posterior to another device or type, float32 or float64.
+
+        Tensors that are there already are shared, not copied.
+        """
         check_destination(device, dtype)
 
-        def copy(tensor: Tensor) -> Tensor:
+        def move(tensor: Tensor) -> Tensor:
             return tensor.to(device=device, dtype=dtype)
 
         return replace(
             self,
-            features=copy(self.features),
-            targets=copy(self.targets),
-            lengthscales=copy(self.lengthscales),
-            signal_variance=copy(self.signal_variance),
-            noise_variance=copy(self.noise_variance),
-            offset=copy(self.offset),
-            cholesky=copy(self.cholesky),
-            weights=copy(self.weights),
+            features=move(self.features),
+            targets=move(self.targets),
+            lengthscales=move(self.lengthscales),
+            signal_variance=move(self.signal_variance),
+            noise_variance=move(self.noise_variance),
+            offset=move(self.offset),
+            cholesky=move(self.cholesky),
+            weights=move(self.weights),
         )
 
     def predict(self, state: Tensor, input: Tensor | None = None) -> Gaussian:

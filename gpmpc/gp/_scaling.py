@@ -14,7 +14,7 @@ from gpmpc.gaussian import check_tensors
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scaling:
     """An affine map of every column, scaled = (value - offset) / factor.
 

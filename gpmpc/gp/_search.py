@@ -175,7 +175,7 @@ class OutputSearch:
         # length-scales of features at rest.
         at_rest = features.constant & ~ignored
         self._log_scales = np.log(np.where(at_rest, prior, features.scales))
-        self._log_output = np.log(_output_std(targets))
+        self._log_output = np.log(output_std(targets))
         self._box = search_box(
             self._log_scales, self._log_output, settings.signal_to_noise_limit
         )
@@ -356,10 +356,10 @@ def plain_theta(scales: np.ndarray, targets: np.ndarray) -> np.ndarray:
         scales: std(x~) (d,).
         targets: y (N,).
     """
-    return np.append(np.log(scales), np.log([_output_std(targets), _PLAIN_RATIO]))
+    return np.append(np.log(scales), np.log([output_std(targets), _PLAIN_RATIO]))
 
 
-def _output_std(targets: np.ndarray) -> float:
+def output_std(targets: np.ndarray) -> float:
     """Computes the standard deviation of scaled targets (N,), or their magnitude.
 
     Where the prior mean is far from them, signals are of their magnitude.

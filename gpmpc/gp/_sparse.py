@@ -210,7 +210,10 @@ def _output_sums(
     """Computes the sums of one output, whose targets are (N, 1)."""
     step = max(_ENTRIES // len(Z), 64)
     sums_of_block: Any = _block_sums
-    if torch.is_grad_enabled() and step < len(x):
+    in_graph = torch.is_grad_enabled() and any(
+        tensor.requires_grad for tensor in (Lz, Z, x, y, *kernel)
+    )
+    if in_graph and step < len(x):
         # ``checkpoint`` passes tensors on to ``backward`` only as plain arguments.
         sums_of_block = partial(
             checkpoint, _block_sums, use_reentrant=True, preserve_rng_state=False

@@ -27,12 +27,11 @@ from gpmpc.gp._data_checks import (
     Columns,
     ColumnsAtRest,
     checked_targets,
-    column_scales,
 )
 from gpmpc.gp._kernel import Hyperparameters, kernel_matrix
 from gpmpc.gp._prior_scales import PriorLengthscales
 from gpmpc.gp._scaling import Scaling, centre, identity
-from gpmpc.gp._search import FAILED, plain_theta, search_box
+from gpmpc.gp._search import FAILED, output_std, plain_theta, search_box
 from gpmpc.gp._sparse import (
     JITTER,
     Method,
@@ -445,8 +444,8 @@ class _NegativeBound:
         """Lower and upper bounds of the vector in two columns."""
         log_scales = self._scales.log().numpy()
         boxes = [
-            search_box(log_scales, log_output, _SIGNAL_TO_NOISE)
-            for log_output in np.log(column_scales(self._y.numpy()))
+            search_box(log_scales, math.log(output_std(targets)), _SIGNAL_TO_NOISE)
+            for targets in self._y.numpy().T
         ]
         smallest = (self._x.amin(0) / self._scales).numpy()
         largest = (self._x.amax(0) / self._scales).numpy()

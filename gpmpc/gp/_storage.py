@@ -223,12 +223,9 @@ def write_model(
         "created": now(),
         "metadata": dict(metadata or {}),
     }
-    try:
-        text = json.dumps({**header, "checksum": _checksum(header, arrays)})
-    except (TypeError, ValueError) as error:
-        raise SettingError(
-            "metadata", f"must be what JSON can hold; {error}"
-        ) from error
+    header = _as_read(header)
+    text = json.dumps({**header, "checksum": _checksum(header, arrays)})
+    _check_length(text)
     write_whole(path, safetensors.numpy.save(arrays, {"gpmpc": text}))
 
 
@@ -264,9 +261,39 @@ def write_npz(header: dict[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **arrays)
     with zipfile.ZipFile(content, "a") as archive:
+        header = _as_read(header)
         header = header | {"checksum": _npz_checksum(header, archive)}
-        archive.writestr(_HEADER, json.dumps(header, indent=2))
+        text = json.dumps(header, indent=2)
+        _check_length(text)
+        archive.writestr(_HEADER, text)
     return content.getvalue()
+
+
+def _as_read(header: dict[str, Any]) -> dict[str, Any]:
+    """Returns a header as a reader will find it: in JSON every key is text.
+
+    A checksum of anything else would not be that of what is read.
+
+    Raises:
+        SettingError: JSON cannot hold it.
+    """
+    try:
+        return json.loads(json.dumps(header))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise SettingError(
+            "metadata", f"must be what JSON can hold; {error}"
+        ) from error
+
+
+def _check_length(text: str) -> None:
+    """Raises ``SettingError`` where a header is longer than readers take."""
+    if len(text) > _LONGEST:
+        raise SettingError(
+            "metadata",
+            f"must leave a header of at most {_LONGEST} characters (names, parameters "
+            f"and metadata as JSON); got {len(text)}: keep long series in a file of "
+            "their own",
+        )
 
 
 def read_npz(

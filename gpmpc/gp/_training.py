@@ -58,7 +58,7 @@ from gpmpc.signals import Signals
 _ONE_THREAD = 1000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Training:
     """The result of a training.
 
@@ -212,6 +212,13 @@ class Trainer:
             predicts=posterior.predicts,
             seed=seed,
             start=replace(posterior, noise_variance=noise),
+            columns=Columns.of_tensors(
+                features,
+                targets,
+                posterior.input_dim,
+                predicts=posterior.predicts,
+                signals=posterior.signals,
+            ),
         )
         return training.with_signals(posterior.signals)
 
@@ -351,7 +358,9 @@ class Trainer:
         newly_moving = was_constant & ~data.constants.features
         theta[:, :-2][:, newly_moving] = np.log(features.scales)[newly_moving]
         targets = start.targets.cpu().double().numpy()
-        never_changed = constant_columns(targets, self.resolution)
+        never_changed = constant_columns(
+            targets, self.resolution, data.columns.magnitudes
+        )
         return [
             None if constant else row
             for row, constant in zip(theta, never_changed, strict=True)

@@ -59,7 +59,7 @@ def check_function(key: str, value: Any, example: str) -> None:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrainingData:
     """What a training learns from, in the units of the data, and how it is scaled."""
 
@@ -124,7 +124,7 @@ def read_training_data(
     target_scaling = settings.scaling(targets, output_names)
 
     if columns is None:
-        columns = Columns.numbered(features, targets, input_dim, predicts)
+        columns = Columns.of_tensors(features, targets, input_dim, predicts)
     data = TrainingData(
         features=features,
         targets=targets,

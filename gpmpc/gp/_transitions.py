@@ -8,7 +8,8 @@ where they are known: tables of pandas and CSV files have names.
 
 import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,7 +38,7 @@ _EXPECTED = "a file of transitions"
 
 
 @explains_arguments
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Transitions:
     """N observed transitions of a system with n states and m inputs, as float64.
 
@@ -260,7 +261,9 @@ class Transitions:
             return _from_file(path, x[:-1], u[:-1], after[1:], signals)
         stems = _without_affixes(next_names, signals.state_names)
         order = order_of(stems, signals.state_names)
-        if order is not None:
+        if order is None:
+            _check_places(next_names, signals.state_names)
+        else:
             after = after[:, order]
         return _from_file(path, x, u, after, signals)
 
@@ -340,11 +343,39 @@ def _without_affixes(labels: Sequence[Any], names: Sequence[Any]) -> Sequence[An
     """Strips from labels one prefix and one suffix around the names, if there are."""
     if not all(isinstance(label, str) for label in (*labels, *names)):
         return labels
-    for name in names:
-        prefix, found, suffix = labels[0].partition(name)
-        if found and {f"{prefix}{each}{suffix}" for each in names} == set(labels):
+    for prefix, suffix in _affixes(labels[0], names):
+        if {f"{prefix}{each}{suffix}" for each in names} == set(labels):
             return [label.removeprefix(prefix).removesuffix(suffix) for label in labels]
     return labels
+
+
+def _affixes(label: str, names: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Yields what stands before and after each name wherever a label holds it."""
+    for name in names:
+        place = label.find(name)
+        while place >= 0:
+            yield label[:place], label[place + len(name) :]
+            place = label.find(name, place + 1)
+
+
+def _check_places(labels: Sequence[str], names: Sequence[str]) -> None:
+    """Raises ``DataError`` where a column names another state than that of its place.
+
+    A name counts where it is a word of the label: ``x`` in ``x_after``, not in ``max``.
+    """
+
+    def holds(label: str, name: str) -> bool:
+        word = rf"(?<![^\W_]){re.escape(name)}(?![^\W_])"
+        return re.search(word, label) is not None
+
+    for label, own_name in zip(labels, names, strict=False):
+        others = [name for name in names if holds(label, name)]
+        if others and not holds(label, own_name):
+            raise DataError(
+                f"next_states: column {label!r} stands in the place of state "
+                f"{own_name!r}; give next states in the order of the states "
+                f"({', '.join(names)})"
+            )
 
 
 def _check_name_list(key: str, names: Any) -> None:

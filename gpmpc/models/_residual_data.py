@@ -138,7 +138,8 @@ def residual_columns(
     next_states = transitions.next_states
     larger = torch.maximum(states.abs(), next_states.abs())
     magnitudes = (pseudo_inverse.abs() @ larger[..., None]).amax(dim=0)[:, 0]
-    steps = (pseudo_inverse @ (next_states - states)[..., None])[..., 0]
+    change = state_difference(next_states, states, features.angles)
+    steps = (pseudo_inverse @ change[..., None])[..., 0]
     deviations = steps.std(dim=0, correction=0)
     deviations = torch.where(deviations > RESOLUTION, deviations, 1.0)
     return Columns(

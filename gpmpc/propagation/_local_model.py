@@ -25,7 +25,7 @@ from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.propagation._propagator import Propagator, Sensitivity, differentiate
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LocalModel:
     """A model s+ = A s + B u + c near a belief and an input; maybe a batch of them."""
 
@@ -68,11 +68,16 @@ def linearize(
     See Also:
         ``gpmpc.models.linearize``, at points; ``differentiate``.
     """
+    check_method("propagator", propagator, "propagate", "Linearization()")
+    check_method("model", model, "predict", "GPPosterior")
     check_kind("belief", belief, Gaussian, "a Gaussian")
     belief = replace(
         belief, mean=belief.mean.detach(), covariance=belief.covariance.detach()
     )
-    input = belief.mean[..., :0] if input is None else input.detach()
+    if input is None:
+        input = belief.mean[..., :0]
+    check_tensors(input=input)
+    input = input.detach()
     if model.output_dim != belief.dim:
         raise ShapeError(
             f"a local model needs an output a state; got {belief.dim} states, "

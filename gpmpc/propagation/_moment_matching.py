@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from gpmpc._calls import explains_arguments
-from gpmpc.exceptions import UnsupportedModel
+from gpmpc.exceptions import UnsupportedModel, check_flag
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp._backend import host_arrays
 from gpmpc.gp._posterior import AffineForm, GPPosterior
@@ -60,6 +60,7 @@ class MomentMatching(NoisyPropagator):
     """
 
     def __init__(self, diagonal: bool = False, process_noise: bool = True):
+        check_flag("diagonal", diagonal)
         super().__init__(process_noise)
         self.diagonal = diagonal
 

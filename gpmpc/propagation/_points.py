@@ -9,24 +9,35 @@ Uhlmann, 2004; van der Merwe, 2004). The default parameters give the spherical c
 rule (Arasaratnam and Haykin, 2009), whose weights are positive, so that no covariance
 can come out indefinite.
 
-Where outputs are angles, the values of all points are shifted by whole turns towards
-that of the first before they are averaged: the mean of 3.1 and -3.1 rad is pi, not 0.
+Where outputs are angles, whole turns are counted before values are averaged: the mean
+of 3.1 and -3.1 rad is pi, not 0. An output that is a state, now or a step later, is
+expected to differ from its value at the mean by as much as the point does; any other by
+nothing. Values come within half a turn of what is expected. So a wide belief over an
+angle stays wide, whether the model wraps or not.
 
 Monte Carlo: the reference for every other. Its standard error falls as one over the
 root of the number of samples.
 """
 
+import logging
 import math
+from collections.abc import Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc._angles import angles_of, whole_turns
+from gpmpc._angles import TURN, angles_of, whole_turns
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, check_number
-from gpmpc.gaussian import Gaussian, square_root, square_root_differential
+from gpmpc.gaussian import (
+    Gaussian,
+    constant_arrays,
+    square_root,
+    square_root_differential,
+)
 from gpmpc.propagation._linearization import (
     SecondOrderExpansion,
     expand_to_second_order,
@@ -40,8 +51,12 @@ from gpmpc.propagation._propagator import (
     checked_arguments,
 )
 
+_log = logging.getLogger(__name__)
 # samples predicted at once: bounds the memory at about chunk * N * outputs numbers
 _CHUNK = 1000
+# part of the points that may lie further than a quarter turn from the first before the
+# log says that turns may be miscounted
+_FAR_POINTS = 0.01
 
 
 class _SigmaPoints(NamedTuple):
@@ -214,7 +229,12 @@ class Unscented(NoisyPropagator):
     ) -> NextMoments:
         """Returns the moments of predictions at the points."""
         weights = self._weights(belief.mean, belief.dim)
-        values = _near_the_first(predictions.mean, model)
+        values = _with_turns(
+            predictions.mean,
+            centre=predictions.mean[..., 0, :],
+            steps=steps,
+            model=model,
+        )
         mean = weights.mean @ values
         centred = values - mean[..., None, :]
         covariance = centred.mT @ (weights.covariance[:, None] * centred)
@@ -294,7 +314,10 @@ class MonteCarlo(NoisyPropagator):
             predictions = model.predict(states, _repeated(input, states))
             means.append(predictions.mean)
             covariances = covariances + predictions.covariance.sum(-3)
-        values = _near_the_first(torch.cat(means, dim=-2), model)
+        values = torch.cat(means, dim=-2)
+        if angles_of(model):
+            centre = model.predict(belief.mean, input).mean
+            values = _with_turns(values, centre=centre, steps=steps, model=model)
         mean = values.mean(-2)
         centred = values - mean[..., None, :]
         sampled = centred.mT @ centred / (self.samples - 1)
@@ -318,16 +341,55 @@ def _repeated(input: Tensor, states: Tensor) -> Tensor:
     return input[..., None, :].expand(*states.shape[:-1], input.shape[-1])
 
 
-def _near_the_first(values: Tensor, model: Any) -> Tensor:
-    """Shifts a model's outputs at points (*batch, points, k) by whole turns.
+def _with_turns(values: Tensor, centre: Tensor, steps: Tensor, model: Any) -> Tensor:
+    """Counts the whole turns of outputs that are angles; all others stay.
 
-    Those of angles come within half a turn of the first point's; all others stay.
+    Args:
+        values: Outputs at points (*batch, points, k).
+        centre: Outputs at the belief's mean (*batch, k).
+        steps: The points, from the mean (*batch, points, n).
+        model: A model of next states, or of measurements.
     """
     angles = angles_of(model)
     if not angles:
         return values
-    angle_values = values[..., angles]
-    turns = whole_turns(angle_values - angle_values[..., :1, :])
-    shifted = values.clone()
-    shifted[..., angles] = angle_values - turns
-    return shifted
+    deviations = values[..., angles] - centre[..., None, angles]
+    states = _states_of_outputs(model)
+    if states is None:
+        expected = torch.zeros_like(deviations)
+    else:
+        expected = steps[..., [states[a] for a in angles]]
+    turns = whole_turns(deviations - expected)
+    if states is None:
+        _warn_of_wide_angles(deviations - turns, type(model).__name__)
+    counted = values.clone()
+    counted[..., angles] = values[..., angles] - turns
+    return counted
+
+
+def _states_of_outputs(model: Any) -> Sequence[int] | None:
+    """Returns the state that each output is, now or later; None where it is none."""
+    if hasattr(model, "measured_states"):
+        return model.measured_states
+    is_dynamics = model.output_dim == model.state_dim
+    return range(model.state_dim) if is_dynamics else None
+
+
+def _warn_of_wide_angles(deviations: Tensor, name: str) -> None:
+    """Logs once where angles (*batch, points, angles) spread over half a turn."""
+    arrays = constant_arrays(deviations)
+    if arrays is None:
+        return
+    is_far = np.abs(arrays[0]) > TURN / 4
+    if is_far.mean(axis=-2).max(initial=0.0) > _FAR_POINTS:
+        _log_wide_angles(name)
+
+
+@cache
+def _log_wide_angles(name: str) -> None:
+    _log.warning(
+        "an angle of %s spreads over more than half a turn under a belief: its turns "
+        "may be miscounted, and the belief corrected the wrong way. Begin with a "
+        "narrower belief, or declare an angle that is a state by Measurement.of_states",
+        name,
+    )

@@ -8,8 +8,14 @@ import torch
 from torch import Tensor
 
 from gpmpc._calls import explains_arguments
-from gpmpc._dynamics import batched_jacobian, check_query
-from gpmpc.exceptions import DataError, SettingError, check_flag
+from gpmpc._dynamics import batched_jacobian, check_query, has_gps_in_graph
+from gpmpc.exceptions import (
+    DataError,
+    SettingError,
+    check_flag,
+    check_kind,
+    check_method,
+)
 from gpmpc.gaussian import (
     Gaussian,
     check_tensors,
@@ -19,7 +25,7 @@ from gpmpc.gaussian import (
 from gpmpc.signals import Signals, signals_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Propagation:
     """A belief after one step.
 
@@ -36,7 +42,7 @@ class Propagation:
     deficit: Tensor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Sensitivity:
     """Derivatives of the next belief N(mu+, Sigma+) by the belief N(mu, Sigma) and u.
 
@@ -187,6 +193,7 @@ def differentiate(
     See Also:
         ``linearize``, for plans; ``rollout``.
     """
+    check_method("propagator", propagator, "propagate", "Linearization()")
     closed_form = getattr(propagator, "differentiate", None)
     if closed_form is not None:
         result = closed_form(model, belief, input)
@@ -230,6 +237,7 @@ def by_autograd(
             belief.covariance.flatten(-2),
             input.expand(*batch, input.shape[-1]),
         ),
+        function_in_graph=has_gps_in_graph(model),
     )
     _, mean, covariance, cross_covariance, deficit = values
     by_covariance = by_covariance.unflatten(-1, (n, n))
@@ -264,8 +272,8 @@ def checked_arguments(model: Any, belief: Gaussian, input: Tensor | None) -> Ten
     Returns:
         The control (*batch, m).
     """
-    if not isinstance(belief, Gaussian):
-        raise SettingError("belief", f"must be a Gaussian; got {type(belief).__name__}")
+    check_method("model", model, "predict", "GPPosterior")
+    check_kind("belief", belief, Gaussian, "a Gaussian")
     if belief.names:
         signals_of(model).check("the model", Signals(belief.names), "it", "belief")
     input = belief.mean[..., :0] if input is None else input
@@ -297,21 +305,25 @@ def _check_finite(name: str, array: np.ndarray) -> None:
 
 
 def _check_semidefinite(covariance: np.ndarray) -> None:
-    largest = np.abs(covariance).max(initial=0.0)
-    round_off = np.finfo(covariance.dtype).eps ** 0.5 * largest
-    gap = np.abs(covariance - np.swapaxes(covariance, -1, -2)).max(initial=0.0)
-    if gap > round_off:
+    precision = np.finfo(covariance.dtype)
+    # of each matrix of a batch: a wide one says nothing of the others
+    largest = np.abs(covariance).max(axis=(-2, -1), keepdims=True, initial=0.0)
+    round_off = precision.eps**0.5 * np.maximum(largest, precision.tiny)
+    gaps = np.abs(covariance - np.swapaxes(covariance, -1, -2))
+    if (gaps > round_off).any():
         raise DataError(
             "the belief's covariance must be symmetric; got entries that differ by "
-            f"{float(gap):.3g}"
+            f"{float(gaps.max()):.3g}"
         )
     eye = np.eye(covariance.shape[-1], dtype=covariance.dtype)
     try:
         np.linalg.cholesky(covariance + round_off * eye)
     except np.linalg.LinAlgError:
-        lowest = float(np.linalg.eigvalsh(covariance).min())
-        if lowest < -round_off:
+        lowest = np.linalg.eigvalsh(covariance).min(axis=-1, keepdims=True)[..., None]
+        is_wrong = lowest < -round_off
+        if is_wrong.any():
             raise DataError(
                 "the belief's covariance must be positive semidefinite; got an "
-                f"eigenvalue of {lowest:.3g} (largest entry {float(largest):.3g})"
+                f"eigenvalue of {float(lowest[is_wrong][0]):.3g} "
+                f"(largest entry {float(largest[is_wrong][0]):.3g})"
             ) from None

@@ -246,6 +246,8 @@ class DualActiveSet:
             record[layout.STATUS] = layout.NUMERICAL_TROUBLE
             guess = as_record(warm_start, len(problem.q), len(problem.lower))
             status = solve_kernel(*problem, guess, memory, record)
+        else:
+            problem = _for_kernel(problem)
 
         def late() -> bool:
             if self.time_limit is None:
@@ -347,6 +349,15 @@ class Prepared:
             )
         seconds = perf_counter() - began
         return _new(QPSolution, (record[x_slice], problem, caps, record, 0.0, seconds))
+
+
+def _for_kernel(problem: QuadraticProgram) -> QuadraticProgram:
+    """Copies what the checked kernel refuses: arrays that are read-only or unaligned.
+
+    The unchecked one takes them, as it writes to none of these.
+    """
+    P, q, G, lower, upper = (np.require(part, float, "CAW") for part in problem)
+    return QuadraticProgram.unchecked(P, q, G, lower, upper)
 
 
 def _is_final(record: Array, problem: QuadraticProgram) -> bool:

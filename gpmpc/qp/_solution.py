@@ -294,7 +294,7 @@ def as_record(warm_start: WarmStart, n: int, M: int) -> Array:
     if warm_start is None:
         return layout.NO_RECORD
     if isinstance(warm_start, QPSolution):
-        return np.ascontiguousarray(warm_start.record, dtype=np.float64)
+        return np.require(warm_start.record, np.float64, ["C", "A", "W"])
     return layout.warm_record(_read_active_set(warm_start, M), n)
 
 

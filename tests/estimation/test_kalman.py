@@ -244,6 +244,36 @@ def test_sigma_points_have_the_same_innovation_past_half_a_turn():
             assert torch.allclose(update.belief.mean, exact.belief.mean, atol=loose)
 
 
+@pytest.mark.parametrize("observer", [Unscented(), MonteCarlo(400, seed=3)])
+def test_a_heading_that_nobody_knows_is_corrected_the_right_way(observer, caplog):
+    """Points past half a turn of their sensor came back on the other side."""
+    model = Known(lambda x, u: x, [0.01] * 4)
+    sensor = Measurement.of_states(4, [0, 1], [0.01, 0.1], angles=[0])
+    wide = Gaussian(
+        torch.zeros(4, dtype=F), torch.diag(torch.tensor([2.0, 1, 1, 1], dtype=F) ** 2)
+    )
+    update = KalmanFilter(model, sensor, observer=observer).update(wide, [1.0, 0.5])
+    exact = KalmanFilter.extended(model, sensor).update(wide, [1.0, 0.5])
+    loose = 0.15 if isinstance(observer, MonteCarlo) else 1e-9
+    assert torch.allclose(update.covariance, exact.covariance, rtol=loose, atol=loose)
+    assert torch.allclose(update.belief.mean, exact.belief.mean, atol=loose)
+    assert not caplog.records
+
+
+def test_turns_that_cannot_be_counted_are_said_in_the_log(caplog):
+    class Bearing(Measurement):
+        """A name of its own: the log says it once for each."""
+
+    shown = Bearing(1, 0.01 * torch.eye(1, dtype=F), lambda x: x.atan(), angles=[0])
+    other = Bearing(1, 0.01 * torch.eye(1, dtype=F), lambda x: 2 * x, angles=[0])
+    model = Known(lambda x, u: x, [0.01])
+    prior = Gaussian(torch.zeros(1, dtype=F), torch.eye(1, dtype=F))
+    for sensor, count in ((shown, 0), (other, 1), (other, 1)):
+        KalmanFilter.unscented(model, sensor).update(prior, [0.1])
+        assert len(caplog.records) == count
+    assert "angle of Bearing spreads over more than half a turn" in caplog.text
+
+
 def test_a_flight_across_half_a_turn_is_estimated_as_any_other():
     """The pendulum hangs at pi here: the sensor flips between both ends of its turn."""
     hanging = Known(

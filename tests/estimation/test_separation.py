@@ -17,6 +17,7 @@ from gpmpc.estimation import (
 from gpmpc.exceptions import DataError, UnsupportedModel
 from gpmpc.gp import (
     GPPosterior,
+    SlidingWindow,
     SparseTrainer,
     Trainer,
     Transitions,
@@ -104,6 +105,9 @@ def test_after_the_separation_all_that_was_learned_is_still_known():
     apart = append_transitions(separated, rows[:5])
     assert torch.allclose(apart.weights, further.weights, rtol=1e-9)
     assert torch.equal(apart.noise_variance, separated.noise_variance)
+    one_row = SlidingWindow(points=1)
+    last = one_row(one_row(separated, rows[:1]), rows[1:2])
+    assert torch.allclose(last.observation_noise, gp.noise_variance, rtol=1e-9)
     noise = estimate_process_noise(gp, rows).variance
     assert torch.allclose(estimate_process_noise(separated, rows).variance, noise)
     again = separate_noise(separated, rows)

@@ -296,6 +296,16 @@ def test_later_changes_of_the_model_leave_the_frozen_one_alone():
     assert torch.equal(gp.predict(query).mean, before)
 
 
+class DoubledScale(ScaleKernel):
+    def forward(self, x1, x2, **settings):
+        return 2 * super().forward(x1, x2, **settings)
+
+
+class SlopedMean(ConstantMean):
+    def forward(self, x):
+        return super().forward(x) + x[..., 0]
+
+
 def with_transform():
     model = one_output(10, ScaleKernel(RBFKernel()))
     model.outcome_transform = torch.nn.Identity()
@@ -328,6 +338,21 @@ def with_transform():
             ),
             UnsupportedModel,
             "must be a GaussianLikelihood; got FixedNoiseGaussianLikelihood",
+        ),
+        (
+            lambda: one_output(10, ScaleKernel(RBFKernel(), active_dims=(0,))),
+            UnsupportedModel,
+            "got ScaleKernel on some dimensions",
+        ),
+        (
+            lambda: one_output(10, DoubledScale(RBFKernel())),
+            UnsupportedModel,
+            "got DoubledScale",
+        ),
+        (
+            lambda: one_output(10, RBFKernel(), mean=SlopedMean()),
+            UnsupportedModel,
+            "zero or constant; got SlopedMean",
         ),
         (with_transform, UnsupportedModel, "carries an outcome_transform"),
         (

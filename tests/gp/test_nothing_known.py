@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from gpmpc._angles import wrap
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import (
@@ -226,6 +227,41 @@ def test_residuals_at_rest_may_be_a_whole_step_elsewhere(caplog):
     assert model.residual.signal_variance[0].sqrt() == pytest.approx(step)
     assert "targets of the 60 rows: what is missed of state 1 (0)" in caplog.text
     assert "rows: input 2 (0.5)." in caplog.text
+
+
+def test_a_sensor_that_flips_makes_no_step_of_a_residual_larger():
+    A = torch.tensor([[1.0, 0.1], [0.0, 1.0]])
+    x = torch.stack([torch.linspace(2.9, 3.4, 40), torch.linspace(0, 1, 40) ** 2], 1)
+    variances = []
+    for show in (lambda angle: angle, wrap):
+        rows = [torch.stack([show(a[:, 0]), a[:, 1]], dim=1) for a in (x, x @ A.mT)]
+        data = Transitions(rows[0], np.empty((40, 0)), rows[1])
+        nominal = Affine(A, torch.zeros(2, 0), torch.zeros(2))
+        trainer = Trainer(restarts=0, resolution=1e-6)
+        model = ResidualModel.train(nominal, data, angles=[0], trainer=trainer)
+        variances.append(model.residual.signal_variance)
+    assert torch.allclose(variances[1], variances[0])
+
+
+def test_a_refit_calls_columns_by_the_names_of_the_posterior(caplog):
+    signals = Signals(["angle", "rate"], ["torque", "wind"])
+    first = train(replace(hover(), signals=signals), restarts=0).posterior
+    caplog.clear()
+    Trainer(restarts=0).refit(first)
+    assert "rows: wind (0.5)." in caplog.text
+
+
+def test_round_off_is_no_change_to_a_refit_either(rng):
+    """Differences of states around 1e6 move by their round-off."""
+    x = np.column_stack([1e6 + rng.uniform(-1, 1, 60), rng.uniform(-1, 1, 60)])
+    after = x + np.column_stack([1e-8 * rng.uniform(-1, 1, 60), np.sin(x[:, 1])])
+    after[40:, 0] += np.sin(x[40:, 1])
+    data = Transitions(x, np.empty((60, 0)), after)
+    trainer = Trainer(restarts=0, predicts="difference")
+    still = trainer(data[:40]).posterior
+    assert float(still.signal_variance[0]) == pytest.approx(1.0)
+    refit = trainer.refit(still, data[40:])
+    assert refit.explored[0] == trainer(data).explored[0]  # from the plain start
 
 
 def test_angles_at_rest_are_named_as_what_is_seen_of_them(caplog):

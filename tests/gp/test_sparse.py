@@ -303,6 +303,25 @@ def test_training_sums_up_many_transitions_in_a_few_points(settings, caplog):
     assert "iteration 10, minus the bound" in caplog.text
 
 
+def test_more_rows_than_a_block_are_trained_without_a_warning(monkeypatch, recwarn):
+    monkeypatch.setattr("gpmpc.gp._sparse._ENTRIES", 600)  # 64 points at a time
+    x, y, _ = problem(rows=150)
+    trainer = SparseTrainer(inducing=10, iterations=1, subset=20, restarts=0)
+    assert len(trainer.fit(x, y, 1, "value").posterior) == 10
+    assert not recwarn.list
+
+
+def test_targets_below_a_billionth_are_learned_in_their_own_box():
+    x, y, _ = problem(rows=80, noise=1e-4)
+    trainer = SparseTrainer(
+        inducing=30, iterations=10, subset=30, restarts=0, resolution=0.0
+    )
+    small = trainer.fit(x, 1e-11 * y, 1, "value").posterior
+    plain = trainer.fit(x, y, 1, "value").posterior
+    ratio = small.signal_variance / plain.signal_variance
+    assert torch.allclose(1e22 * ratio, torch.ones(2), rtol=0.5)
+
+
 def test_fewer_points_than_inducing_points_are_all_taken():
     data = transitions(20)
     assert (

@@ -146,6 +146,17 @@ def test_a_file_of_the_first_format_is_read(make, tmp_path):
     assert load_metadata(tmp_path / "old.npz")["format_version"] == 1
 
 
+def test_metadata_of_any_keys_are_read_back(tmp_path):
+    """Numbers as keys sort otherwise than the texts that JSON makes of them."""
+    path = tmp_path / "gp.safetensors"
+    saved = posterior()
+    errors = {1: 0.1, 5: 0.2, 10: 0.3, "mean": 0.2}
+    save_posterior(saved, path, metadata={"rmse": errors, 2: "two"})
+    assert_same(load_posterior(path), saved)
+    metadata = load_metadata(path)["metadata"]
+    assert metadata == {"rmse": {str(k): v for k, v in errors.items()}, "2": "two"}
+
+
 def test_another_process_predicts_the_same_bits(tmp_path):
     gp = posterior(size=60, n=3)
     save_posterior(gp, tmp_path / "gp.safetensors")
@@ -343,6 +354,10 @@ def test_what_cannot_be_saved_says_what_to_do(tmp_path):
             GPPosterior(**parts | {"weights": gp.weights * torch.nan}),
             tmp_path / "gp.safetensors",
         )
+
+    curve = np.random.default_rng(0).normal(size=60_000).tolist()
+    with pytest.raises(SettingError, match="at most 1048576 characters .* got 12"):
+        save_posterior(gp, tmp_path / "gp.safetensors", metadata={"loss": curve})
 
     class Derived(GPPosterior):
         pass

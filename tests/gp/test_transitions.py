@@ -18,6 +18,7 @@ def test_what_is_saved_is_loaded_to_the_bit(transitions, tmp_path):
     loaded = Transitions.load(tmp_path / "data.npz")
     for name in ("states", "inputs", "next_states"):
         assert torch.equal(getattr(loaded, name), getattr(transitions, name))
+    assert (loaded == transitions, loaded == loaded) == (False, True)  # no error
     assert [path.name for path in tmp_path.iterdir()] == ["data.npz"]
 
 
@@ -169,6 +170,39 @@ def test_a_csv_file_gives_its_named_columns(tmp_path, delimiter):
     )
     assert paired.next_states.tolist() == [[2], [5], [8]]
     assert paired.inputs.shape == (3, 0)
+
+
+@pytest.mark.parametrize(
+    "labels", [("next_x", "next_v"), ("x_t+1", "v_t+1"), ("xx", "xv")]
+)
+def test_next_states_are_sorted_wherever_their_names_stand(tmp_path, labels):
+    """The first x of next_x is in next, and no affix of v."""
+    pandas = pytest.importorskip("pandas")
+    table = pandas.DataFrame([[1.0, 2.0, 3.0, 4.0, 5.0]])
+    table.columns = ["x", "v", "u", *labels]
+    table.to_csv(tmp_path / "log.csv", index=False)
+    data = Transitions.from_csv(
+        tmp_path / "log.csv", states=["v", "x"], inputs=["u"], next_states=labels
+    )
+    assert data.next_states.tolist() == [[5.0, 4.0]]
+    for states, expected in ((["x", "v"], [4.0, 5.0]), (["v", "x"], [5.0, 4.0])):
+        data = Transitions(table[states], table[["u"]], table[list(labels)])
+        assert data.next_states.tolist() == [expected]
+
+
+def test_next_states_of_other_places_are_refused(tmp_path):
+    (tmp_path / "log.csv").write_text("x,v,after_x,v_then,p\n1,2,3,4,5\n")
+
+    def read(*next_states):
+        return Transitions.from_csv(
+            tmp_path / "log.csv", states=["x", "v"], inputs=[], next_states=next_states
+        )
+
+    assert read("after_x", "v_then").next_states.tolist() == [[3, 4]]
+    assert read("p", "v_then").next_states.tolist() == [[5, 4]]
+    for labels in (("v_then", "after_x"), ("p", "after_x")):
+        with pytest.raises(DataError, match="stands in the place of state"):
+            read(*labels)
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,15 @@ import torch
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian, square_root
 from gpmpc.gp import GPPosterior
-from gpmpc.models import Affine, ResidualModel
+from gpmpc.models import Affine, KnownModel, ResidualModel
 from gpmpc.propagation import (
     Linearization,
     MeanEquivalence,
     MomentMatching,
     MonteCarlo,
     Unscented,
+    differentiate,
+    linearize,
 )
 
 DETERMINISTIC = {
@@ -343,6 +345,10 @@ def test_settings_out_of_range_are_refused():
         (lambda: Unscented(alpha=0.0), "alpha: must be a number above 0; got 0.0"),
         (lambda: Unscented(beta=torch.nan), "beta: must be a number; got nan"),
         (
+            lambda: MomentMatching(diagonal="false"),
+            "diagonal: must be true or false; got 'false'",
+        ),
+        (
             lambda: MonteCarlo(samples=1),
             "samples: must be a whole number, 2 or more; got 1",
         ),
@@ -380,3 +386,86 @@ def test_monte_carlo_gives_the_sample_moments_of_its_draws(samples):
     assert torch.allclose(
         propagation.cross_covariance, both[:2, 2:], rtol=1e-10, atol=1e-14
     )
+
+
+def silent_heading(n):
+    """Nothing moves, and the GP of the first state's sine and cosine adds nothing."""
+    silent = GPPosterior.from_hyperparameters(
+        torch.full((1, 2), 1e6),
+        torch.zeros(1, 1),
+        lengthscales=torch.ones(1, 2),
+        signal_variance=torch.full((1,), 1e-12),
+        noise_variance=torch.full((1,), 1e-12),
+        input_dim=0,
+        predicts="value",
+    )
+    B = torch.eye(n)[:, -1:]
+    return ResidualModel(Affine.identity(n, 0), silent, B, [0], [], 0, angles=[0])
+
+
+class WrappedHeading(KnownModel):
+    """A user's model whose first state turns by 1 rad and is shown within a turn."""
+
+    angles = (0,)
+
+    def __init__(self, n):
+        def step(x, u):
+            turned = torch.remainder(x[..., :1] + 1.0, 2 * torch.pi)
+            return torch.cat([turned, x[..., 1:]], dim=-1)
+
+        super().__init__(step, state_dim=n, input_dim=0)
+
+
+@pytest.mark.parametrize("make", [silent_heading, WrappedHeading])
+@pytest.mark.parametrize("n", [2, 6])
+def test_a_wide_belief_over_an_angle_stays_as_wide(n, make):
+    """Points beyond half a turn from the first were folded to the other side."""
+    model = make(n)
+    at = Gaussian(torch.linspace(0.5, 1.0, n), 2.2**2 * torch.eye(n))
+    exact = Linearization().propagate(model, at)
+    propagators = [(Unscented(), 1e-9)]
+    propagators += [(MonteCarlo(300, seed=seed), 1.2) for seed in range(3)]
+    for propagator, loose in propagators:
+        propagation = propagator.propagate(model, at)
+        assert torch.allclose(
+            propagation.belief.covariance, exact.belief.covariance, atol=loose
+        )
+        assert torch.allclose(
+            propagation.cross_covariance, exact.cross_covariance, atol=loose
+        )
+        mean = propagation.belief.mean
+        assert torch.allclose(mean, exact.belief.mean, atol=loose / 2)
+
+
+def test_a_wide_stage_of_a_plan_hides_no_broken_one():
+    eye = torch.eye(2)
+    batch = Gaussian(torch.zeros(3, 2), torch.stack([0 * eye, 1e8 * eye, -0.1 * eye]))
+    message = r"an eigenvalue of -0\.1 \(largest entry 0\.1\)"
+    with pytest.raises(DataError, match=message):
+        MeanEquivalence()(gp(), batch, torch.zeros(1))
+    crooked = torch.tensor([[1.0, 0.1], [0.0, 1.0]])
+    batch = Gaussian(torch.zeros(2, 2), torch.stack([1e8 * eye, crooked]))
+    with pytest.raises(DataError, match="must be symmetric; .* differ by 0.1"):
+        MeanEquivalence()(gp(), batch, torch.zeros(1))
+
+
+def test_what_is_no_model_propagator_or_input_is_named():
+    u = torch.zeros(1)
+    for call, message in (
+        (lambda: linearize(Linearization(), gp(), belief(), np.zeros(1)), "input"),
+        (lambda: linearize(None, gp(), belief(), u), "propagator"),
+        (lambda: linearize(Linearization(), None, belief(), u), "model"),
+        (lambda: differentiate(None, gp(), belief(), u), "propagator"),
+        (lambda: differentiate(Unscented(), None, belief(), u), "model"),
+        (lambda: Unscented()(None, belief(), u), "model"),
+        (lambda: Unscented()(gp(), torch.zeros(2), u), "belief"),
+    ):
+        with pytest.raises(SettingError, match=f"^{message}: must be "):
+            call()
+
+
+def test_results_are_compared_without_an_error():
+    one = Linearization().propagate(gp(), belief(), torch.zeros(1))
+    other = Linearization().propagate(gp(), belief(), torch.zeros(1))
+    assert one == one
+    assert one != other

@@ -8,7 +8,7 @@ from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend, remove_points
-from gpmpc.models import Affine, ResidualModel
+from gpmpc.models import Affine, DelayedModel, ResidualModel
 from gpmpc.propagation import (
     Linearization,
     MeanEquivalence,
@@ -310,6 +310,42 @@ def test_hyperparameters_with_gradients_are_left_to_torch():
     numeric = (
         mean(log_scale.detach() + shift) - mean(log_scale.detach() - shift)
     ) / 2e-6
+    assert torch.allclose(gradient[0, 1], numeric, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("around", ["nothing", "a nominal model", "a delay"])
+def test_linearised_beliefs_keep_gradients_by_hyperparameters(around):
+    features = draw(12, 3)
+    targets = draw(12, 2)
+    u = torch.zeros(1)
+
+    def loss(scale):
+        model = GPPosterior.from_hyperparameters(
+            features,
+            targets,
+            scale.exp(),
+            torch.ones(2),
+            0.1 * torch.ones(2),
+            1,
+            "value",
+        )
+        if around != "nothing":
+            nominal = Affine.identity(2, 1)
+            model = ResidualModel(nominal, model, torch.eye(2), [0, 1], [0], 1)
+        if around == "a delay":
+            model = DelayedModel(model, 1)
+        n = model.state_dim
+        at = Gaussian(0.1 * torch.ones(n), 0.1 * torch.eye(n))
+        after, slopes = differentiate(Linearization(), model, at, u)
+        covariance = Linearization()(model, at, u).covariance
+        return after.belief.mean.sum() + covariance.sum() + slopes.mean_by_mean.sum()
+
+    log_scale = torch.zeros(2, 3, requires_grad=True)
+    (gradient,) = torch.autograd.grad(loss(log_scale), log_scale)
+    shift = torch.zeros(2, 3)
+    shift[0, 1] = 1e-6
+    after = loss(log_scale.detach() + shift)
+    numeric = (after - loss(log_scale.detach() - shift)) / 2e-6
     assert torch.allclose(gradient[0, 1], numeric, rtol=1e-6, atol=1e-8)
 
 

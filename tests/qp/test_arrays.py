@@ -56,6 +56,32 @@ def test_an_odd_array_is_read_as_what_it_is(odd, position, rng):
             )
 
 
+@pytest.mark.parametrize("odd", ["read-only", "unaligned"])
+def test_odd_arrays_are_looked_at_a_second_time_too(odd, rng):
+    """Where the first look does not end as solved, the checked kernel takes over."""
+    P = np.eye(40)
+    q = 10 * rng.normal(size=40)
+    G = rng.normal(size=(20, 40))
+    lower = -np.ones(60)
+    cold = DualActiveSet().solve(QuadraticProgram.from_stacked(P, q, G, lower, -lower))
+    odd_record = cold._replace(record=ODD[odd](cold.record))
+    arrays = [ODD[odd](array) for array in (P, q, G, lower, -lower)]
+    solver = DualActiveSet(time_limit=9.0)  # looks at the clock after 25 iterations
+    prepared = solver.prepare(P, G)
+    solver.solve(QuadraticProgram.from_stacked(P, q, G, lower, -lower))
+    for solution in (
+        prepared.solve(arrays[1], *arrays[3:]),
+        solver.solve(QuadraticProgram.unchecked(*arrays)),
+        solver.solve(QuadraticProgram.unchecked(P[:, ::-1][:, ::-1], *arrays[1:])),
+    ):
+        assert solution.iterations > 25
+        np.testing.assert_allclose(solution.x, cold.x, atol=1e-9)
+    other = QuadraticProgram.unchecked(arrays[0], -q, *arrays[2:])
+    warm = solver.solve(other, odd_record)
+    assert warm.iterations > 25
+    np.testing.assert_allclose(warm.x, DualActiveSet().solve(other).x, atol=1e-9)
+
+
 def test_an_axis_of_length_one_may_have_any_stride():
     """NumPy calls such arrays contiguous whatever their strides.
 
