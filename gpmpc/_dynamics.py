@@ -293,9 +293,10 @@ def predict_with_jacobian(
         state: (*batch, n).
         input: (*batch, m).
     """
-    arrays = constant_arrays(state, input)
-    is_constant = arrays is not None and not has_gps_in_graph(model)
-    if is_constant and hasattr(model, "linearize"):
+    arrays = None
+    if hasattr(model, "linearize") and not has_gps_in_graph(model):
+        arrays = constant_arrays(state, input)
+    if arrays is not None:
         check_query(model, state, input)
         return _linearize_batch(model, arrays, state.shape[:-1])
     method = getattr(model, "predict_with_jacobian", None)

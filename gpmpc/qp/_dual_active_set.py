@@ -356,7 +356,9 @@ def _for_kernel(problem: QuadraticProgram) -> QuadraticProgram:
 
     The unchecked one takes them, as it writes to none of these.
     """
-    P, q, G, lower, upper = (np.require(part, float, "CAW") for part in problem)
+    P, q, G, lower, upper = (
+        np.require(part, float, ["C", "A", "W"]) for part in problem
+    )
     return QuadraticProgram.unchecked(P, q, G, lower, upper)
 
 
