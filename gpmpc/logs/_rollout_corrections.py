@@ -4,10 +4,16 @@ Several are fitted, between the rollout as it is and a ridge regression that kno
 model, and averaged. Which of them are is chosen on whole runs, for each group of states
 and step: each run, or block of one, is corrected by what the others say. The best one
 comes first, then, one by one, that with which the mean is best (Caruana et al., 2004,
-Ensemble selection from libraries of models). Each run counts alike, by its errors over
-those of the ridge regression there: the runs to come may be like any of them. What is
-chosen on a few runs is chosen by chance as well: of it as much is taken as the gains of
-single runs agree, and up to a half of the average is the ridge regression where that
+Ensemble selection from libraries of models).
+
+What is best is told stretch by stretch: a run, or a part of one where there are few. On
+each, errors are taken over those of what costs nothing, the ridge regression or a
+constant state, whichever is better *there*; and being behind counts twice. For the rows
+to come may be like any of the stretches. A mean over all rows would be that of the
+wildest ones, and what loses at rest would be chosen.
+
+What is chosen on a few stretches is chosen by chance as well: of it as much is taken as
+their gains agree. And up to a half of the average is what costs nothing, where that
 costs next to nothing.
 """
 
@@ -29,11 +35,16 @@ _PRIORS = tuple(
     for penalty in (np.inf, 10.0, 1.0, 0.1, 0.01, 0.001)
     for movement in (1.0, 0.5, 0.0)
 )
+_ROLLOUT = _PRIORS.index(Prior(np.inf, 1.0))  # as it is
 _RIDGE = _PRIORS.index(Prior(PENALTY, 0.0))  # the ridge regression without a model
+_STILL = _PRIORS.index(Prior(np.inf, 0.0))  # a constant state
 _NOTHING = 1e-300  # an error that is added, so that ratios of exact rollouts are one
 _MEMBERS = 8  # of an average, at most; one may be in it several times
-_RIDGE_SHARES = (0.5, 0.375, 0.25, 0.125)  # of an average, the first that costs little
-_COST = 0.04  # of the mean error, that such a share may add
+_HEDGES = (0.5, 0.375, 0.25, 0.125)  # shares of what costs nothing, to be tried
+_COST = 0.04  # of regret, that such a share may add
+_STRETCHES = 8  # of all runs, about
+_WINDOWS_OF_STRETCH = 2  # one after the other, that a stretch has rows for at least
+_EXACT = 1e-4  # of what costs nothing: an error that is smaller counts as exact
 
 
 @dataclass(frozen=True)
@@ -105,17 +116,16 @@ def choose_averages(
         judged_steps: Whose errors decide.
     """
     errors = _errors_on_other_runs(kinematics, rollouts, judged_steps)
-    runs = rollouts.windows.runs
+    stretches = _stretches_of(rollouts.windows)
     columns_by_group = rollouts.windows.space.error_columns
     shares = np.empty((len(_PRIORS), len(judged_steps), len(columns_by_group)))
     ratios = np.empty(shares.shape[1:])
     for k in range(len(judged_steps)):
         for g, columns in enumerate(columns_by_group):
             own = errors[:, :, k, columns]
-            shares[:, k, g] = _choose_shares(own, runs)
+            shares[:, k, g] = _choose_shares(own, _Regret(own, stretches))
             averaged = _mean_length(_average(shares[:, k, g], own))
-            # The first prior leaves the rollouts as they are.
-            without = _mean_length(own[0])
+            without = _mean_length(own[_ROLLOUT])
             ratios[k, g] = (averaged + _NOTHING) / (without + _NOTHING)
     return Averages(shares, ratios)
 
@@ -164,70 +174,127 @@ def _are_apart(rollouts: Rollouts, is_own: np.ndarray) -> np.ndarray:
     return are_apart if are_apart.any() else ~is_own
 
 
-def _choose_shares(errors: Array, runs: np.ndarray) -> Array:
+def _choose_shares(errors: Array, regret: "_Regret") -> Array:
     """Chooses the shares (A,) of an average of errors (A, W, e).
 
     Args:
         errors: Of each correction, on runs that it was not fitted to.
-        runs: Number of the run of each window (W,).
+        regret: Of errors.
     """
-    weights = _weights_by_run(np.linalg.norm(errors[_RIDGE], axis=-1), runs)
     counts = np.zeros(len(errors))
     total = np.zeros(errors.shape[1:])
     least = np.inf
     for members in range(1, _MEMBERS + 1):
-        scores = np.linalg.norm((total + errors) / members, axis=-1) @ weights
-        best = scores.argmin()
-        if scores[best] >= least:
+        regrets = regret.means((total + errors) / members)
+        best = regrets.argmin()
+        if regrets[best] >= least:
             break
-        least = scores[best]
+        least = regrets[best]
         counts[best] += 1
         total = total + errors[best]
-    shares = _without_chance(counts / counts.sum(), errors, runs, weights)
-    return _with_ridge(shares, errors)
+    shares = _without_chance(counts / counts.sum(), errors, regret)
+    return _with_hedge(shares, errors, regret)
 
 
-def _without_chance(
-    shares: Array, errors: Array, runs: np.ndarray, weights: Array
-) -> Array:
-    """Moves shares (A,) to the rollout as it is, as far as the runs' gains disagree.
+class _Regret:
+    """How far errors are ahead of what costs nothing, or behind, by stretches.
 
-    With g the mean gain of a run and s its standard error, g^2 / (g^2 + s^2) of them
-    stays.
+    Args:
+        errors: Of each correction (A, W, e), among them what costs nothing.
+        stretches: Number of the stretch of each window (W,).
+    """
+
+    def __init__(self, errors: Array, stretches: np.ndarray):
+        self._stretches = stretches
+        free = errors[[_RIDGE, _STILL]]
+        self._least = self._mean_lengths(free).min(axis=0)
+
+    def by_stretch(self, errors: Array) -> Array:
+        """Computes the regrets (..., stretches) of errors (..., W, e).
+
+        They are logarithms of mean errors over those of what costs nothing; positive
+        ones count twice.
+        """
+        ratios = (self._mean_lengths(errors) + _NOTHING) / (self._least + _NOTHING)
+        logarithms = np.log(np.maximum(ratios, _EXACT))
+        return logarithms + np.maximum(logarithms, 0.0)
+
+    def means(self, errors: Array) -> Array:
+        """Computes the mean regrets (...) of errors (..., W, e)."""
+        return self.by_stretch(errors).mean(axis=-1)
+
+    def _mean_lengths(self, errors: Array) -> Array:
+        """Computes the mean lengths (..., stretches) of errors (..., W, e)."""
+        lengths = np.linalg.norm(errors, axis=-1)
+        is_of = np.eye(self._stretches.max() + 1)[self._stretches]
+        return lengths @ (is_of / is_of.sum(axis=0))
+
+
+def _stretches_of(windows: Windows) -> np.ndarray:
+    """Returns the number of the stretch that each window is of (W,).
+
+    A run is one; where there are few runs, they are cut into as many as have rows for
+    some windows one after the other.
+    """
+    runs = np.unique(windows.runs, return_inverse=True)[1]
+    firsts = np.full(runs.max() + 1, np.inf)
+    np.minimum.at(firsts, runs, windows.times)
+    rows = (windows.times - firsts[runs]) / windows.time_step  # since its run began
+    lengths = np.zeros(len(firsts))
+    np.maximum.at(lengths, runs, rows)
+    lengths += windows.ahead
+    wanted = np.round(_STRETCHES * lengths / lengths.sum())
+    most = lengths // (_WINDOWS_OF_STRETCH * windows.ahead)
+    counts = np.maximum(np.minimum(wanted, most), 1)
+    spans = np.maximum(lengths - windows.ahead + 1, 1)
+    parts = np.floor(rows * (counts / spans)[runs])
+    # A gap may leave one of them empty.
+    return np.unique(runs * (_STRETCHES + 1) + parts, return_inverse=True)[1]
+
+
+def _without_chance(shares: Array, errors: Array, regret: _Regret) -> Array:
+    """Moves shares (A,) to the best single correction, as far as gains disagree.
+
+    That is the rollout as it is, the ridge regression or a constant state. With g the
+    mean gain of a stretch upon it and s its standard error, g^2 / (g^2 + s^2) of the
+    shares stays.
 
     Args:
         shares: That were chosen (A,).
-        errors: (A, W, e), those of the rollout as it is first.
-        runs: Number of the run of each window (W,).
-        weights: Of the windows (W,).
+        errors: Of each correction (A, W, e).
+        regret: Of errors.
     """
-    lengths = np.linalg.norm(errors[0], axis=-1)
-    gains = lengths - np.linalg.norm(_average(shares, errors), axis=-1)
-    by_run = np.bincount(np.unique(runs, return_inverse=True)[1], weights * gains)
-    gain = by_run.mean()
+    singles = np.array([_ROLLOUT, _RIDGE, _STILL])
+    single = singles[regret.means(errors[singles]).argmin()]
+    of_single = regret.by_stretch(errors[single])
+    gains = of_single - regret.by_stretch(_average(shares, errors))
+    gain = gains.mean()
     if gain <= 0:
-        return np.eye(1, len(shares))[0]
-    if len(by_run) < 2:
+        return np.eye(len(shares))[single]
+    if len(gains) < 2:
         return shares
-    variance = by_run.var(ddof=1) / len(by_run)
+    variance = gains.var(ddof=1) / len(gains)
     kept = gain**2 / (gain**2 + variance)
     moved = kept * shares
-    moved[0] += 1 - kept
+    moved[single] += 1 - kept
     return moved
 
 
-def _with_ridge(shares: Array, errors: Array) -> Array:
-    """Gives the ridge regression the largest share (A,) that costs next to nothing.
+def _with_hedge(shares: Array, errors: Array, regret: _Regret) -> Array:
+    """Gives what costs nothing the largest share (A,) that costs next to nothing.
 
     Args:
         shares: Of the corrections (A,).
         errors: Of each (A, W, e).
+        regret: Of errors.
     """
-    most = (1 + _COST) * _mean_length(_average(shares, errors))
-    for share in _RIDGE_SHARES:
-        mixed = (1 - share) * shares
-        mixed[_RIDGE] += share
-        if _mean_length(_average(mixed, errors)) <= most:
+    free = np.array([_RIDGE, _STILL])
+    best = free[regret.means(errors[free]).argmin()]
+    most = regret.means(_average(shares, errors)) + _COST
+    for hedge in _HEDGES:
+        mixed = (1 - hedge) * shares
+        mixed[best] += hedge
+        if regret.means(_average(mixed, errors)) <= most:
             return mixed
     return shares
 
@@ -240,19 +307,6 @@ def _average(shares: Array, errors: Array) -> Array:
 def _mean_length(errors: Array) -> float:
     """Computes the mean length of errors (W, e)."""
     return float(np.linalg.norm(errors, axis=-1).mean())
-
-
-def _weights_by_run(reference: Array, runs: np.ndarray) -> Array:
-    """Returns weights (W,) with which each run counts alike.
-
-    Args:
-        reference: Errors of the windows (W,), over whose mean in a run those of the run
-            are taken.
-        runs: Number of the run of each window (W,).
-    """
-    numbers = np.unique(runs, return_inverse=True)[1]
-    total = np.bincount(numbers, reference)
-    return 1 / (len(total) * np.maximum(total, _NOTHING))[numbers]
 
 
 def fit_correction(
