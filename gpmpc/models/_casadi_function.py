@@ -1,5 +1,6 @@
 """Functions that are written in CasADi, as parts of models."""
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, to_array
-from gpmpc.exceptions import UnsupportedModel
+from gpmpc.exceptions import ShapeError, UnsupportedModel
 
 
 @explains_arguments
@@ -69,12 +70,27 @@ class CasadiFunction:
                 f"a CasADi function of this model {rule}; got {self.function}"
             )
 
+    def _check_widths(self, arguments: Sequence[Any]) -> None:
+        """Raises ``ShapeError`` unless arguments (.., d_i) have the function's sizes.
+
+        The compiled loops would read behind shorter ones.
+        """
+        widths = [argument.shape[-1] for argument in arguments]
+        if widths != self.sizes:
+            takes = ", ".join(f"({size},)" for size in self.sizes)
+            got = ", ".join(f"({width},)" for width in widths)
+            raise ShapeError(f"{self.function.name()} takes {takes}; got {got}")
+
     def __call__(self, *arguments: Tensor) -> Tensor:
         """Computes the value (*batch, rows), or (*batch, rows, columns) of a matrix.
 
         Args:
             arguments: (*batch, d_i) each.
+
+        Raises:
+            ShapeError: They have other sizes than the function's arguments.
         """
+        self._check_widths(arguments)
         like = arguments[0]
         points = [
             to_array(argument).reshape(-1, size)
@@ -93,7 +109,11 @@ class CasadiFunction:
         Returns:
             The values (K, rows) and their derivatives by each argument (K, rows, d_i);
             of a matrix (K, rows, columns) and (K, rows, columns, d_i).
+
+        Raises:
+            ShapeError: They have other sizes than the function's arguments.
         """
+        self._check_widths(arguments)
         has_tape = self.tape is not None
         linearize = self._linearize_tape if has_tape else self._linearize_by_casadi
         parts = linearize(*arguments)

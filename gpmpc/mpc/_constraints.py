@@ -243,8 +243,8 @@ def _stack(parts: Sequence[_Rows], n: int, horizon: int) -> _Rows:
             elastic=np.empty(0, dtype=bool),
         )
     return _Rows(
-        F=np.concatenate([part.F for part in parts]),
-        # kernels ignore strides, and stacked columns may lie column by column
+        # kernels ignore strides, and stacked arrays may lie column by column
+        F=np.ascontiguousarray(np.concatenate([part.F for part in parts])),
         lower=np.ascontiguousarray(np.hstack([part.lower for part in parts])),
         upper=np.ascontiguousarray(np.hstack([part.upper for part in parts])),
         kappa=np.concatenate([part.kappa for part in parts]),

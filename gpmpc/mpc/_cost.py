@@ -272,7 +272,8 @@ def expand_function(
     Raises:
         FunctionNotFinite: A value or a derivative is not finite.
         SettingError: The function takes parameters, and there are none.
-        ShapeError: Its values have another shape.
+        ShapeError: Its values have another shape, or it takes others of states, inputs
+            or parameters.
     """
     least, most = _count_arguments(function)
     arguments = [states, inputs] if parameters is None else [states, inputs, parameters]
@@ -280,7 +281,10 @@ def expand_function(
         rule = f"must come with every call: {name} is a function of them"
         raise SettingError("parameters", rule)
     if hasattr(function, "n_in"):
-        values, *jacobians = _casadi_function(function).linearize(*arguments[:most])
+        try:
+            values, *jacobians = _casadi_function(function).linearize(*arguments[:most])
+        except ShapeError as error:
+            raise ShapeError(f"{name}: {error}") from None
     else:
         tensors = [torch.as_tensor(argument) for argument in arguments[2:most]]
         checked = _CheckedFunction(name, function, count, tensors)
@@ -387,9 +391,17 @@ _FLOAT64 = torch.empty(0, dtype=torch.float64)
 _casadi_function = lru_cache(maxsize=64)(CasadiFunction)
 
 
-@lru_cache(maxsize=256)
 def _count_arguments(function: Any) -> tuple[int, int]:
     """Returns how many arguments a function takes at least and at most."""
+    try:
+        return _count_once(function)
+    except TypeError:  # such as of a callable dataclass, which has no hash
+        return _count_once.__wrapped__(function)
+
+
+@lru_cache(maxsize=256)
+def _count_once(function: Any) -> tuple[int, int]:
+    """Counts the arguments of a function that has a hash, once; see its caller."""
     if hasattr(function, "n_in"):
         return function.n_in(), function.n_in()
     try:
@@ -430,7 +442,7 @@ def read_numbers(
         SettingError: It is no list of numbers.
     """
     try:
-        array = np.array(read_array(key, value))
+        array = np.array(read_array(key, value), order="C")  # as kernels read them
     except DataError:
         array = np.empty(())
     if not (array.ndim and array.size):

@@ -61,6 +61,8 @@ def read_request(
     )
     if parameters is not None:
         request = request._replace(parameters=read_parameters(parameters, horizon))
+    if plan is not None and prediction.is_held:
+        raise SettingError("plan", "is not taken by a form that linearises one point")
     _check_kappas(prediction, request)
     if not request.finite:
         return request

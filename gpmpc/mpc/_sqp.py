@@ -127,7 +127,7 @@ class Progress(NamedTuple):
     def after(self, size: float) -> "Progress":
         """Returns the progress after one more step."""
         is_first = math.isinf(self.size)
-        rate = 1.0 if is_first else size / self.size
+        rate = 1.0 if is_first or self.size == 0.0 else size / self.size
         near = _NOISE < size**2 < _NEAR**2
         creeps = self.creeps or (near and not is_first and rate > _CREEP)
         return Progress(
@@ -175,7 +175,7 @@ def measure_continuity(
     last_lengths = () if request.previous is None else request.previous.steps
     if len(last_lengths) == 0:
         return True, squared_length
-    slight = _SLIGHT_STEP * (cost + smallest_cost(prediction, request))
+    slight = _SLIGHT_STEP * (max(cost, 0.0) + smallest_cost(prediction, request))
     return squared_length <= max(slight, _FURTHER * last_lengths[0]), squared_length
 
 
@@ -206,7 +206,7 @@ class Globalization:
         row_prices: Of violated rows (r,), infinite for hard ones.
 
     Attributes:
-        squared_lengths: Of the programs' steps, in the metric of the cost.
+        squared_length: Of the last program's step, in the metric of the cost.
     """
 
     def __init__(
@@ -226,7 +226,7 @@ class Globalization:
         self._defect_prices = np.zeros(blocks * n)
         self._curvature = CurvatureUpdates()
         self._progress = Progress()
-        self.squared_lengths: list[float] = []
+        self.squared_length = math.nan
 
     def correct(
         self, program: CondensedProgram, local: LocalProblem
@@ -256,8 +256,9 @@ class Globalization:
             local, self._merit_terms, self._defect_prices, proposed, multipliers
         )
         self._defect_prices = forecast.defect_prices
-        self.squared_lengths.append(forecast.squared_length)
-        scale = forecast.cost + self._cost_floor
+        self.squared_length = forecast.squared_length
+        # Rounding may leave a cost that is zero below it.
+        scale = max(forecast.cost, 0.0) + self._cost_floor
         offset = math.sqrt(forecast.squared_length / scale)
         self._progress = self._progress.after(max(offset, forecast.defect))
         # A solver that stopped early may propose no step far from the optimum.

@@ -233,7 +233,8 @@ class GPMPC:
         Args:
             belief: What is known of the state.
             reference: Over the horizon, with inputs where the weights ask for them.
-            previous: The last decision; one that is not applicable is ignored.
+            previous: The last decision. Of one that is not applicable only the input
+                counts, as the one that rates and increments start from.
             parameters: Of outputs and smooth constraints, (q,) or by stage (H, q), such
                 as where an obstacle will be.
             plan: To start from in the place of the last one: inputs (H, m), or these
@@ -485,7 +486,7 @@ class _ControlStep:
         self._programs = 0  # solved so far
         self._row_prices = self._prediction.constraints.prices
         self._globalization: Globalization | None = None
-        self._squared_lengths: Sequence[float] = ()  # of the programs' steps
+        self._squared_lengths: list[float] = []  # of the programs' steps
         self._warm_start: QPSolution | None = None
         if request.previous is not None:
             self._warm_start = request.previous.solution
@@ -709,7 +710,7 @@ class _ControlStep:
             )
         globalization = self._globalization
         iterate = globalization.take_step(local, program, solution, planned.plan)
-        self._squared_lengths = globalization.squared_lengths
+        self._squared_lengths.append(globalization.squared_length)
         is_solved = iterate.status is Status.SOLVED
         has_loose_tolerance = self._controller.iterations is None
         return iterate._replace(leaves_defects=not is_solved or has_loose_tolerance)
@@ -734,7 +735,8 @@ class _ControlStep:
         continues, squared_length = measure_continuity(
             self._prediction, request, local, proposed, self._row_prices
         )
-        self._squared_lengths = [squared_length]
+        if continues:
+            self._squared_lengths.append(squared_length)
         return continues
 
     def _planned(

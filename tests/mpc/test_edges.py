@@ -121,3 +121,34 @@ def test_a_plan_that_goes_on_keeps_the_tighter_bound_of_now():
     held = loop.input(np.array([np.nan, 0.0]), Reference(target))
     assert held == pytest.approx([0.5])
     assert loop.last.plan.applicable
+
+
+@pytest.mark.parametrize("probability", [None, 0.95])
+def test_arrays_that_lie_column_by_column_say_the_same(probability):
+    directions = np.array([[1.0, 0.5], [0.0, 1.0]])
+    upper = np.linspace(0.3, 0.5, 2 * H).reshape(H, 2)
+    path = np.linspace(0.0, 2.0, 2 * (H + 1)).reshape(H + 1, 2)
+    limits = np.linspace(1.0, 2.0, 2 * H).reshape(H, 2)
+    decisions = []
+    for order in "CF":
+
+        def laid(array, order=order):
+            return np.array(array, order=order)
+
+        rails = Halfspaces(laid(directions), laid(upper), probability=probability)
+        bounds = Box(-laid(limits), laid(limits))
+        problem = Problem(tracking(inputs=2), bounds, constraints=[rails])
+        mode = "none" if probability is None else "zero_order"
+        controller = GPMPC(
+            KnownModel(cart_step, 2, 2),
+            Linearization(),
+            problem,
+            H,
+            [0.0, 0.0],
+            PredictionSettings(covariance=mode),
+        )
+        belief = Gaussian(torch.zeros(2), torch.diag(torch.tensor([1e-3, 4e-3])))
+        decisions.append(controller.control(belief, Reference(laid(path))))
+    by_rows, by_columns = decisions
+    assert by_rows.status.solved
+    assert np.array_equal(by_columns.inputs, by_rows.inputs)

@@ -375,3 +375,20 @@ def test_functions_are_checked_where_a_flight_starts():
         match=r"h or its gradient is not finite at x = .* where the flight starts",
     ):
         Problem(cost, constraints=[log_of_inputs]).check_start(*start)
+
+
+@pytest.mark.parametrize("goal", [350.3, 1e3 / 3, 77.7])
+def test_a_cost_of_outputs_that_rounds_below_zero_is_none(goal):
+    """At rest at the goal the squares cancel, to either sign."""
+    model = KnownModel(lambda x, u: x + 0.1 * u, state_dim=2, input_dim=2)
+    output = LeastSquares(lambda x: x[:, :1], [10.0], [goal])
+    problem = Problem(Tracking([0.0] * 2, [1e-4] * 2), outputs=[output])
+    for count in (None, 5):
+        steering = GPMPC(
+            model, Linearization(), problem, 20, [0.0] * 2, iterations=count
+        )
+        last = None
+        for _ in range(2):
+            at = Gaussian.certain([goal, 0.0])
+            last = steering.control(at, Reference([0.0, 0.0]), last)
+            assert np.abs(last.input).max() < 1e-3

@@ -1,3 +1,5 @@
+from dataclasses import dataclass
+
 import casadi
 import numpy as np
 import pytest
@@ -43,6 +45,16 @@ def disc(x, u, p):
 def casadi_disc():
     x, u, p = (casadi.SX.sym(name, 2) for name in "xup")
     return casadi.Function("disc", [x, u, p], [RADIUS - casadi.norm_2(x - p)])
+
+
+@dataclass
+class Disc:
+    """The disc as an object that is called, which has no hash."""
+
+    radius: float
+
+    def __call__(self, x, u, p):
+        return self.radius - torch.linalg.vector_norm(x - p, dim=-1)
 
 
 def controller(constraint, **settings):
@@ -264,3 +276,47 @@ def test_mistakes_are_one_clear_error():
         SettingError, match="angles: must be a list of different indices"
     ):
         Tracking([1.0] * 2, [1.0], angles=[2])
+
+
+def test_a_casadi_function_takes_parameters_of_its_own_size():
+    x, u, p = casadi.SX.sym("x", 2), casadi.SX.sym("u", 2), casadi.SX.sym("p", 3)
+    function = casadi.Function("disc", [x, u, p], [p[2] - casadi.norm_2(x - p[:2])])
+    steering = controller(Inequality(function))
+    at = Gaussian.certain(np.zeros(2))
+    goal = Reference([1.0, 0.0])
+    assert steering.control(at, goal, parameters=[*CENTRE, RADIUS]).status.solved
+    for parameters in (CENTRE, [*CENTRE, RADIUS, 1.0]):
+        with pytest.raises(
+            ShapeError, match=r"h: disc takes \(2,\), \(2,\), \(3,\); got"
+        ):
+            steering.control(at, goal, parameters=parameters)
+
+
+def test_a_callable_object_without_a_hash_is_a_constraint():
+    goal = [1.0, 0.0]
+    expected = flown(controller(Inequality(disc)), goal, steps=3)
+    assert np.array_equal(
+        flown(controller(Inequality(Disc(RADIUS))), goal, steps=3), expected
+    )
+
+
+def test_a_decision_tells_the_steps_of_all_its_programs():
+    """The first plan keeps the circle as it was seen from outside, and leaves it."""
+    inside = Inequality(lambda x, u: (x**2).sum(dim=-1) - 0.25)
+    decision = controller(inside).control(
+        Gaussian.certain(np.zeros(2)), Reference([1.2, 0.0])
+    )
+    assert decision.iterations > 1
+    assert len(decision.steps) == decision.iterations
+
+
+def test_a_form_of_one_point_takes_no_plan():
+    model = integrator()
+    settings = {"prediction": PredictionSettings("velocity")}
+    steering = GPMPC(model, Linearization(), FREE, H, [0.0] * 2, **settings)
+    with pytest.raises(SettingError, match="plan: is not taken by a form that"):
+        steering.control(
+            Gaussian.certain(np.zeros(2)),
+            Reference([1.0, 0.0]),
+            plan=np.zeros((H, 2)),
+        )
