@@ -23,6 +23,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from gpmpc._trust import LOOKUPS, package_of
 from gpmpc.exceptions import GpmpcError
 
 # Endings of the files that results depend on: code, models for simulators, printed
@@ -144,24 +145,38 @@ def own_code(settings: Any) -> dict[str, str]:
         settings: Plain data, nested.
 
     Returns:
-        One fingerprint a module or package that a ``_target_`` begins with.
+        One fingerprint a module or package that a name of code begins with.
     """
-    names = sorted({target.partition(".")[0] for target in _targets(settings)})
+    names = sorted({package_of(name) for name in _names_of_code(settings)})
     fingerprints = {name: _own_fingerprint(name) for name in names}
     return {name: digits for name, digits in fingerprints.items() if digits}
 
 
-def _targets(settings: Any) -> Iterator[str]:
-    """Yields every ``_target_`` in nested settings."""
+def _names_of_code(settings: Any) -> Iterator[str]:
+    """Yields every name of code in nested settings, however it is named there."""
     if isinstance(settings, Mapping):
-        target = settings.get("_target_")
-        if isinstance(target, str):
-            yield target
+        if isinstance(settings.get("_target_"), str):
+            yield from _names_in_call(settings)
         for value in settings.values():
-            yield from _targets(value)
+            yield from _names_of_code(value)
     elif isinstance(settings, list | tuple):
         for value in settings:
-            yield from _targets(value)
+            yield from _names_of_code(value)
+
+
+def _names_in_call(call: Mapping[str, Any]) -> Iterator[str]:
+    """Yields what one ``_target_`` calls, looks up, imports, or lets a model name."""
+    target = call["_target_"]
+    yield target
+    path = call.get("path")
+    if target in LOOKUPS and isinstance(path, str):
+        yield path
+    environment = call.get("environment")
+    if isinstance(environment, str) and ":" in environment:  # gymnasium imports it
+        yield environment
+    trusted = call.get("trusted")
+    if isinstance(trusted, list | tuple):
+        yield from (package for package in trusted if isinstance(package, str))
 
 
 @cache

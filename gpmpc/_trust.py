@@ -88,6 +88,11 @@ SETTINGS_CODE = frozenset(
     f"{module}.{name}" for module, names in _SETTINGS.items() for name in names.split()
 )
 
+#: functions of Hydra that return code by the name that is their argument ``path``
+LOOKUPS = tuple(
+    f"hydra.utils.get_{kind}" for kind in ("class", "method", "object", "static_method")
+)
+
 _NEVER = {*sys.stdlib_module_names, "gpmpc", "hydra", "omegaconf"}
 
 

@@ -18,6 +18,7 @@ from gpmpc._provenance import (
     source_fingerprint,
 )
 from gpmpc.exceptions import GpmpcError
+from gpmpc.studies._run_record import read_record
 
 ROOT = Path(__file__).resolve().parents[1]
 #: files that no number depends on: how documents look, texts of the command line
@@ -192,3 +193,20 @@ def test_own_code_that_cannot_be_parsed_counts_as_it_stands(own):
     (own / "my_script.py").write_text("import (\n")
     _provenance._own_fingerprint.cache_clear()
     assert own_code(SETTINGS)["my_script"] != before["my_script"]
+
+
+@pytest.mark.parametrize(
+    "naming",
+    [
+        {"_target_": "hydra.utils.get_method", "path": "my_robot.plant.make"},
+        {"_target_": "gpmpc.systems.gymnasium_", "environment": "my_robot:Arm-v0"},
+        {"_target_": "gpmpc.logs.load_flyable", "path": "m", "trusted": ["my_robot"]},
+    ],
+)
+def test_own_code_counts_however_settings_name_it(own, naming):
+    settings = {"controller": {"limit": naming, "constraints": [{"h": naming}]}}
+    assert sorted(own_code(settings)) == ["my_robot"]
+    # as a report and a sweep have them, dotted
+    run = {"choices": [], "error": "", "settings": {"system": naming}}
+    run["provenance"] = provenance() | {"own_code": own_code(naming)}
+    assert read_record(Path("error.json"), run).is_of_this_code()

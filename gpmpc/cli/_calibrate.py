@@ -13,11 +13,15 @@ from rich.console import Console
 
 from gpmpc import calibration
 from gpmpc._dynamics import DynamicsModel
-from gpmpc._provenance import is_of_this_code
 from gpmpc.cli._commands import Result
 from gpmpc.cli._folders import write_files
 from gpmpc.cli._log import condition
-from gpmpc.cli._recorded import errors_of_settings, experiment_of_run, recordings
+from gpmpc.cli._recorded import (
+    changes_since,
+    errors_of_settings,
+    experiment_of_run,
+    recordings,
+)
 from gpmpc.exceptions import DataError, check_number
 from gpmpc.plotting import calibration_figure, png
 from gpmpc.recording import Run, read_run
@@ -48,13 +52,13 @@ def calibrate(arguments: argparse.Namespace) -> Result:
             f"{path}: its controller learned no model, or learned it from whole flights"
         )
     model = experiment.model
-    notes = []
+    consequence = "the model that is judged is the one in the file now"
     if model is None:
-        if not is_of_this_code(run.metadata.get("run", {})):
-            notes.append(
-                f"{path} was flown by other code: the model that is judged is what "
-                "this code learns from the same settings"
-            )
+        consequence = (
+            "the model that is judged is what this code learns from the same settings"
+        )
+    notes = [f"{change}: {consequence}" for change in changes_since(run)]
+    if model is None:
         with console.status("learning"):
             model = _learn_again(run, experiment)
     with console.status("predicting"):

@@ -8,7 +8,7 @@ A model that was trained before the run is taken as it is.
 
 import argparse
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,15 @@ from gpmpc._files import write_whole
 from gpmpc.cli._commands import Result
 from gpmpc.cli._export_points import KeptPoints, budget_of, kept_points
 from gpmpc.cli._folders import writing
-from gpmpc.cli._recorded import errors_of_settings, experiment_of_run, recordings
+from gpmpc.cli._recorded import (
+    changes_since,
+    errors_of_settings,
+    experiment_of_run,
+    recordings,
+)
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.export import (
+    Answer,
     CompiledLoop,
     Question,
     answers,
@@ -57,7 +63,18 @@ def export(arguments: argparse.Namespace) -> Result:
         f"written to {folder}: src/gpmpc.h, src/gpmpc.c, and a replay of {steps} steps"
     ]
     lines += kept.lines
-    data = {"folder": str(folder), "steps": steps, **kept.data}
+    lines += [
+        f"{change}: what is exported is what this code makes of the same settings"
+        for change in changes_since(run)
+    ]
+    from_flight = _largest_difference(run, answers(kept.controller, questions, policy))
+    lines.append(f"beside the flight inputs within {from_flight:.2g}")
+    data = {
+        "folder": str(folder),
+        "steps": steps,
+        "difference_from_flight": from_flight,
+        **kept.data,
+    }
     if shutil.which("cc"):
         with console.status("compiling"):
             data |= _measure(kept.controller, questions, precision, policy)
@@ -121,6 +138,18 @@ def _questions(
     inputs = np.tile(controller.initial_input, (H, 1))
     for k, measured in zip(run.steps.tolist(), run.measured, strict=True):
         yield Question(measured, Reference(path[k : k + H + 1], inputs))
+
+
+def _largest_difference(run: Run, flown_again: Iterable[Answer]) -> float:
+    """Returns how far answers lie at most from the inputs that were recorded.
+
+    A controller whose model is learned again by the same code decides the same.
+    """
+    differences = [
+        float(np.abs(answer.input - recorded).max())
+        for answer, recorded in zip(flown_again, run.inputs, strict=True)
+    ]
+    return max(differences, default=0.0)
 
 
 def _measure(

@@ -1,13 +1,15 @@
 """Finds recorded flights, and makes what the settings in them describe."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from gpmpc._provenance import is_of_this_code
 from gpmpc._trust import trusted_packages
 from gpmpc.cli._folders import find_modules_here
 from gpmpc.cli._mistakes import one_line
+from gpmpc.cli._plain_settings import model_fingerprint
 from gpmpc.cli._recorded_settings import read_settings
 from gpmpc.exceptions import DataError
 from gpmpc.recording import Run
@@ -16,6 +18,7 @@ from gpmpc.studies._run_folder import RECORDING
 if TYPE_CHECKING:
     from gpmpc.studies.flight import Experiment
 
+_OWN_CODE = "own_code."  # begins the keys of fingerprints of the user's code
 _NO_SETTINGS = "holds no settings, which gpmpc run puts into its recordings"
 
 
@@ -57,6 +60,32 @@ def experiment_of_run(run: Run, trust: Sequence[str]) -> "Experiment":
         if described != (run.state_names, run.input_names):
             raise DataError("its settings describe another system than it recorded")
     return experiment
+
+
+def changes_since(run: Run) -> list[str]:
+    """Returns what has changed since a flight: the code, the file of its model.
+
+    Each is the beginning of a sentence. A recording that does not tell, as those of
+    older versions, is one of other code.
+
+    Args:
+        run: Whose settings are known to be harmless: they made an experiment.
+    """
+    about: Mapping[str, Any] = run.metadata.get("run", {})
+    settings = read_settings(run.config)
+    changes = []
+    of_user = {
+        key.removeprefix(_OWN_CODE): digits
+        for key, digits in about.items()
+        if key.startswith(_OWN_CODE)
+    }
+    if not is_of_this_code({**about, "own_code": of_user}, settings):
+        changes.append(f"{run.path} was flown by other code")
+    digest = about.get("model_sha256")
+    path = settings.get("model", {}).get("path")
+    if digest is not None and model_fingerprint(path) != digest:
+        changes.append(f"{path} has changed since {run.path} was flown")
+    return changes
 
 
 @contextmanager

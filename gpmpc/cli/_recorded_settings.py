@@ -16,6 +16,7 @@ import yaml
 from omegaconf import OmegaConf
 
 from gpmpc._trust import (
+    LOOKUPS,
     SETTINGS_CODE,
     is_trusted,
     may_be_trusted,
@@ -32,9 +33,6 @@ _MOST_ENTRY_CHARACTERS = 5000
 _MOST_ENTRIES = 4000
 _MOST_LEVELS = 20  # lists and dictionaries inside each other
 _MARKS = ("_target_", "_partial_", "_args_", "_recursive_", "_convert_")
-_LOOKUPS = tuple(  # code by its ``path``
-    f"hydra.utils.get_{kind}" for kind in ("class", "method", "object", "static_method")
-)
 _LOAD = "gpmpc.logs.load_flyable"
 
 
@@ -128,7 +126,7 @@ class _Call:
     def code(self) -> Any:
         """The name of what is called, or of what Hydra looks up by its path."""
         target = self.settings["_target_"]
-        return self.settings.get("path") if target in _LOOKUPS else target
+        return self.settings.get("path") if target in LOOKUPS else target
 
 
 def _with_trust(node: Any, trusted: Sequence[str]) -> Any:
@@ -172,7 +170,7 @@ def _check_form(call: _Call) -> None:
     place = call.place
     if not isinstance(settings["_target_"], str) or not isinstance(call.code, str):
         raise DataError(f"its settings name nothing at {_dotted(place, '_target_')}")
-    if settings["_target_"] in _LOOKUPS and {*settings} != {"_target_", "path"}:
+    if settings["_target_"] in LOOKUPS and {*settings} != {"_target_", "path"}:
         raise DataError(f"its settings look code up in another way at {place}")
     for key in ("_partial_", "_recursive_"):
         if not isinstance(settings.get(key, True), bool):

@@ -5,7 +5,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Sized
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from gpmpc._compiling import report_compilation
+from gpmpc._provenance import own_code
 from gpmpc.cli._commands import Result
 from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import folder_of, writing
@@ -253,6 +254,7 @@ class _Recordings:
         self._experiment = experiment
         self._yaml_text = yaml_text
         self._command = to_fly.command
+        self._origin = _origin(plain_settings(to_fly.config, to_fly.options))
         self._live = to_fly.config.live
         episodes = getattr(experiment.learning, "episodes", 0)
         names = [f"episode_{k}.mcap" for k in range(1, 1 + episodes)]
@@ -269,7 +271,7 @@ class _Recordings:
         """
         system = self._experiment.system
         bounds = controller.problem.inputs.by_stage(controller.horizon)
-        gp_size = 0 if training is None else len(training.posterior)
+        gp_size = self._gp_size(training)
         with McapRecorder(
             next(self._paths),
             RecordedSystem.of(system, [side[0] for side in bounds]),
@@ -294,6 +296,11 @@ class _Recordings:
 
             yield on_step
 
+    def _gp_size(self, training: Any) -> int:
+        """Returns how many transitions the model has; 0 where it has none."""
+        model = self._experiment.model if training is None else training.posterior
+        return len(model) if isinstance(model, Sized) else 0
+
     def _metadata(self, training: Any) -> dict[str, Any]:
         """Returns what a reader of the recording needs besides its steps."""
         experiment = self._experiment
@@ -306,4 +313,14 @@ class _Recordings:
             "tracked": " ".join(system.tracked),
             "angles": " ".join(system.angles),
             "noise_std": " ".join(map(str, noise)),
+            **self._origin,
         }
+
+
+def _origin(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what made a flight besides gpmpc: the user's own code, a model's file."""
+    origin: dict[str, Any] = {"own_code": own_code(settings)}
+    model_digest = settings["model"].get("sha256")
+    if model_digest is not None:
+        origin["model_sha256"] = model_digest
+    return origin

@@ -29,7 +29,7 @@ from gpmpc.exceptions import DataError, GpmpcError, SettingError, check_number
 from gpmpc.metrics import tracking_cost
 from gpmpc.recording import read_run
 from gpmpc.studies._document import terminal
-from gpmpc.studies._run_folder import RECORDING
+from gpmpc.studies._run_folder import RECORDING, folder_override
 from gpmpc.studies.tuning import Interval, Search
 
 Candidate = Mapping[str, Any]  # values by setting
@@ -113,7 +113,7 @@ def tune(arguments: Namespace) -> Result:
     least_cost = search.costs[search.best]
     if not math.isfinite(least_cost):
         raise GpmpcError(f"tune: every flight was lost or failed; see {runs.tree}")
-    words = [*choices(tuning.overrides(best)), f"folder={runs.tree / 'best'}"]
+    words = [*choices(tuning.overrides(best)), folder_override(runs.tree / "best")]
     command = run_command(search_options(runs.config.hydra), words)
     base_cost = unchanged_cost if math.isfinite(unchanged_cost) else None
     document = search.document(base_cost, command)

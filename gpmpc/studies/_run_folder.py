@@ -49,6 +49,9 @@ _PROBE_INTERVAL = 0.01  # between two of them [s]
 # Of opening a file of another user, or on a file system that may only be read.
 _NOT_WRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS)
 _NOT_IN_NAME = re.compile(r"[^a-z0-9_=.,+\-\[\]@]")
+# Paths that Hydra reads as they stand, and words that it reads as other values.
+_PLAIN_PATH = re.compile(r"(/|[A-Za-z_])[\w./+-]*", re.ASCII)
+_VALUES_BY_NAME = ("true", "false", "null", "nan", "inf")
 LONGEST_NAME = 150  # characters of a folder's name; file systems take 255 bytes
 
 
@@ -389,6 +392,16 @@ def folder_name(choices: Sequence[str]) -> str:
     name = re.sub(r"[^\w=.,+\-\[\]@]", "_", text, flags=re.ASCII)[:LONGEST_NAME]
     digest = hashlib.sha256(json.dumps(sorted(choices)).encode()).hexdigest()
     return f"{name}-{digest[:10]}"
+
+
+def folder_override(tree: Path) -> str:
+    """Returns ``folder=TREE`` as Hydra reads it, in quotes where it needs them."""
+    path = str(tree)
+    is_plain = _PLAIN_PATH.fullmatch(path) and path.lower() not in _VALUES_BY_NAME
+    if is_plain:
+        return f"folder={path}"
+    escaped = path.replace("'", "\\'")
+    return f"folder='{escaped}'"
 
 
 def difference(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:

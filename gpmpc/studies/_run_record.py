@@ -139,11 +139,12 @@ class RunRecord:
 
     def is_of_this_code(self) -> bool:
         """Whether the code that flew it is that which would fly it now."""
-        targets = [
-            {"_target_": value} if key.endswith("_target_") else value
-            for key, value in self.settings.items()
-        ]
-        return self.code == _code_text(code_fingerprint_or_none(), own_code(targets))
+        sections: dict[str, dict[str, Any]] = {}  # by dotted key
+        for key, value in self.settings.items():
+            section, _, name = key.rpartition(".")
+            sections.setdefault(section, {})[name] = value
+        own = own_code([*sections.values()])
+        return self.code == _code_text(code_fingerprint_or_none(), own)
 
     def row(self) -> dict[str, Any]:
         """Returns its columns in ``Report.runs`` but for cell and seed."""

@@ -10,7 +10,8 @@ and a run that cannot give them is skipped, with the reason.
 import json
 import os
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -22,7 +23,13 @@ import pandas as pd
 from gpmpc.exceptions import DataError
 from gpmpc.studies._document import plain_text
 from gpmpc.studies._index import RunIndex
-from gpmpc.studies._run_folder import ERROR, METRICS, PLAN, folder_name
+from gpmpc.studies._run_folder import (
+    ERROR,
+    METRICS,
+    PLAN,
+    folder_name,
+    folder_override,
+)
 from gpmpc.studies._run_record import (
     DAMAGE,
     MEASURES,
@@ -66,6 +73,9 @@ class Report:
     runs: pd.DataFrame
     #: what could not be read of it, with the reason, one line each
     skipped: tuple[str, ...] = ()
+    #: finished runs that others with the same choices and seed stand for, a line for
+    #: each pair of folders
+    repeated: tuple[str, ...] = ()
 
     @cached_property
     def ended(self) -> list[Any]:
@@ -122,10 +132,16 @@ class Report:
                 for key, value in (self.constants | varied).items()
                 if value != _DEFAULT
             }
-            words = ["gpmpc", "run", "-m", *shlex.split(options), *_overrides(choices)]
+            words = [
+                "gpmpc",
+                "run",
+                "-m",
+                *shlex.split(options),
+                *overrides_of(choices),
+            ]
             if names_seed:
                 words.append(f"{SEED}={','.join(runs.seed)}")
-            words.append(f"folder={self.tree}")
+            words.append(folder_override(self.tree))
             commands.append(plain_text(shlex.join(words)))
         return commands
 
@@ -250,7 +266,7 @@ def _not_there(files: _Files) -> list[RunRecord]:
 
 def _name_of(choices: Choices) -> str:
     """Returns the name of the folder of a run; other choices have another one."""
-    return folder_name(_overrides(choices))
+    return folder_name(overrides_of(choices))
 
 
 def _put_together(
@@ -264,10 +280,12 @@ def _put_together(
     for key in values:
         if key not in variables:
             (constants[key],) = values[key]
+    places = [
+        _Place(tuple(choices[key] for key in variables), choices[SEED])
+        for choices in all_choices
+    ]
     by_place: dict[_Place, RunRecord] = {}
-    for choices, run in zip(all_choices, runs, strict=True):
-        cell = tuple(choices[key] for key in variables)
-        place = _Place(cell, choices[SEED])
+    for place, run in zip(places, runs, strict=True):
         if run.state == "finished" or place not in by_place:
             by_place[place] = run
     cells = tuple(sorted({place.cell for place in by_place}, key=_values_in_order))
@@ -278,7 +296,37 @@ def _put_together(
         cells=cells,
         runs=_table_of(by_place, cells),
         skipped=tuple(skipped),
+        repeated=tuple(_repeated(runs, [by_place[place] for place in places])),
     )
+
+
+def _repeated(
+    runs: Iterable[RunRecord], runs_of_report: Iterable[RunRecord]
+) -> Iterator[str]:
+    """Yields how many finished runs of a folder are left out, and what is shown.
+
+    Args:
+        runs: All that were read.
+        runs_of_report: Of each of them the run that the report has at its place.
+    """
+    counts: Counter[tuple[Path, Path]] = Counter()
+    for run, shown in zip(runs, runs_of_report, strict=True):
+        if run is shown or run.state != "finished":
+            continue
+        assert run.folder is not None
+        assert shown.folder is not None
+        counts[run.folder.parent, shown.folder.parent] += 1
+    for (folder, shown_folder), count in counts.items():
+        others = "others there"
+        advice = ""
+        if folder != shown_folder:
+            others = f"runs of {shown_folder}"
+        if not shown_folder.is_relative_to(folder):
+            advice = f"; gpmpc report {folder} shows them"
+        yield plain_text(
+            f"{count} finished in {folder}: {others} have the same choices and seeds, "
+            f"and are shown{advice}"
+        )
 
 
 class _Place(NamedTuple):
@@ -332,7 +380,7 @@ def _completed_choices(runs: Sequence[RunRecord]) -> list[Choices]:
         others = {
             key: run.setting(key) or usual[key] or _DEFAULT
             for key in keys
-            if not run.choices.get(key)
+            if key not in run.choices
         }
         completed.append(run.choices | others if others else run.choices)
     return completed
@@ -358,6 +406,9 @@ def _values_in_order(values: Sequence[str]) -> list[tuple[int, float, str]]:
     return [in_order(value) for value in values]
 
 
-def _overrides(choices: Choices) -> list[str]:
-    """Returns choices by key as ``key=value`` each."""
-    return [f"{key}={value}" if value else key for key, value in choices.items()]
+def overrides_of(choices: Choices) -> list[str]:
+    """Returns choices by key as ``key=value`` each, or ``~key`` of a deletion."""
+    return [
+        key if key.startswith("~") else f"{key}={value}"
+        for key, value in choices.items()
+    ]

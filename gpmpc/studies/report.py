@@ -24,7 +24,7 @@ from gpmpc.studies._document import (
     with_range,
 )
 from gpmpc.studies._run_folder import LONGEST_NAME
-from gpmpc.studies._runs import Report, in_order, read_report
+from gpmpc.studies._runs import Report, in_order, overrides_of, read_report
 
 __all__ = [
     "Comparison",
@@ -116,6 +116,7 @@ def notes(report: Report) -> dict[str, list[str]]:
         if run.suspicious:
             reasons["Suspicious"].append(f"{folder}: {run.suspicious}")
     reasons["Skipped"] = list(report.skipped)
+    reasons["Repeated"] = list(report.repeated)
     reasons["Mixed code"] = _mixed_code(report)
     return {kind: lines for kind, lines in reasons.items() if lines}
 
@@ -145,7 +146,7 @@ def _lead(report: Report) -> str:
     """Returns how many runs there are and what all of them have in common."""
     lead = f"{_counts(report)}."
     if report.constants:
-        choices = [f"{key}={value}" for key, value in report.constants.items()]
+        choices = overrides_of(report.constants)
         lead += f" All of them: {', '.join(choices)}."
     return lead
 
@@ -259,7 +260,14 @@ def _table(report: Report, measures: Sequence[str]) -> Table:
 def _shown(report: Report, values: Sequence[Any]) -> tuple[str, ...]:
     """Returns the values of a cell's variables in words: no size means all rows."""
     pairs = zip(report.variables, values, strict=True)
-    return tuple(_WORDS.get((name, str(value)), str(value)) for name, value in pairs)
+    return tuple(_word(name, str(value)) for name, value in pairs)
+
+
+def _word(name: str, value: str) -> str:
+    """Returns the value of a setting as a reader calls it."""
+    if name.startswith("~") and not value:
+        return "left out"
+    return _WORDS.get((name, value), value)
 
 
 def _variables(report: Report) -> tuple[str, ...]:
@@ -328,7 +336,7 @@ def _figure(report: Report, index: int, measure: str) -> bytes:
     figure = over_variable(
         figure_label(report.variables[index]),
         [
-            figure_label(_WORDS.get((report.variables[index], str(position)), position))
+            figure_label(_word(report.variables[index], position))
             for position in positions
         ],
         figure_label(report.measures[measure]),

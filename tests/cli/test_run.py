@@ -2,13 +2,18 @@
 
 import argparse
 import json
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
+from gpmpc import _provenance
 from gpmpc._provenance import code_fingerprint
-from gpmpc.cli import _calibrate
+from gpmpc.cli import _calibrate, _export, _recorded, _run
+from gpmpc.cli._plain_settings import plain_settings
 from gpmpc.plotting._recorded import expected
 from gpmpc.recording import read_run
 from tests.cli.command import forked, gpmpc
@@ -73,7 +78,8 @@ def test_a_sweep_names_lost_flights_and_those_flown_before(tmp_path):
 
 def test_a_flight_is_predicted_or_one_line_says_why_not(tmp_path, monkeypatch, capsys):
     """So is a flight filmed, or one line says why not."""
-    assert forked("run", *TINY, "steps=9", cwd=tmp_path).returncode == 0
+    once = ["steps=9", "controller.iterations=1"]  # so that it can be exported
+    assert forked("run", *TINY, *once, cwd=tmp_path).returncode == 0
     done = forked("calibrate", "tree", "--steps", "12", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     rows = json.loads(done.stdout)["rows"]
@@ -91,7 +97,7 @@ def test_a_flight_is_predicted_or_one_line_says_why_not(tmp_path, monkeypatch, c
     assert read_run(recording).metadata["run"]["code"] == code_fingerprint()
     # a flight of other code: the model is learned again, by this code
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(_calibrate, "is_of_this_code", lambda about: False)
+    monkeypatch.setattr(_recorded, "is_of_this_code", lambda about, settings: False)
     arguments = {
         "run": Path("tree"),
         "to": None,
@@ -105,6 +111,14 @@ def test_a_flight_is_predicted_or_one_line_says_why_not(tmp_path, monkeypatch, c
     (written,) = (tmp_path / "tree").glob("*/calibration/calibration.md")
     assert said in written.read_text()
     assert "Intervals hold the model's noise at every step." in written.read_text()
+    # an exported controller is compared with the flight, not only with itself
+    monkeypatch.setattr(shutil, "which", lambda name: None)
+    arguments |= {"precision": "double", "points": None}
+    arguments |= {"budget": None, "chip": None}
+    exported = _export.export(argparse.Namespace(**arguments))
+    assert 0 <= exported.data["difference_from_flight"] < 1e-6
+    said = "was flown by other code: what is exported is what this code makes of"
+    assert said in capsys.readouterr().out
     assert forked("run", *TINY, "steps=3", cwd=tmp_path).returncode == 0
     runs.record_run(tmp_path / "foreign.mcap", steps=3)
     for words, said in (
@@ -200,3 +214,21 @@ def test_compiling_is_told_on_a_pipe_and_in_no_decision(tmp_path):
         times = json.loads(path.read_text())["times"]
         assert times["total"]["largest"] < 1
         assert times["training"] < 10
+
+
+def test_a_recording_tells_what_has_changed_since_its_flight(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    code, model = tmp_path / "my_arm.py", tmp_path / "model.safetensors"
+    code.write_text("MASS = 1.0\n")
+    model.write_bytes(b"1")
+    config = {"system": {"_target_": "my_arm.make"}, "model": {"path": str(model)}}
+    settings = plain_settings(OmegaConf.create(config), {})
+    runs.record_run(tmp_path / "run.mcap", steps=1, metadata=_run._origin(settings))
+    run = replace(read_run(tmp_path / "run.mcap"), config=json.dumps(config))
+    assert _recorded.changes_since(run) == []
+    model.write_bytes(b"2")
+    (change,) = _recorded.changes_since(run)
+    assert change == f"{model} has changed since {run.path} was flown"
+    code.write_text("MASS = 1.5\n")
+    _provenance._own_fingerprint.cache_clear()
+    assert f"{run.path} was flown by other code" in _recorded.changes_since(run)

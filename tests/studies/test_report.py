@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import re
+import shlex
 import time
 import tracemalloc
 from pathlib import Path
@@ -14,10 +15,18 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from gpmpc.cli._overrides import read_override
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import Series, over_variable
-from gpmpc.studies._run_folder import RunFolder
-from gpmpc.studies.report import compare, read_report, sentences, terminal_table
+from gpmpc.studies._run_folder import RunFolder, folder_override
+from gpmpc.studies.report import (
+    compare,
+    notes,
+    read_report,
+    report_document,
+    sentences,
+    terminal_table,
+)
 from tests.studies.made_up import (
     SETTINGS,
     add,
@@ -518,3 +527,41 @@ def test_no_size_means_all_rows(tmp_path):
     html = documents(report)["report.html"]
     assert re.search(r"<td[^>]*>all</td>", html)
     assert not re.search(r"<td[^>]*>null</td>", html)
+
+
+def test_runs_of_equal_choices_in_two_folders_are_named(tmp_path):
+    for folder, error in (("a", 0.1), ("b", 0.2)):
+        for seed in range(2):
+            add(tmp_path / "out" / folder, "convex", seed, error)
+    add(tmp_path / "out" / "a", "convex", 2, 0.1)
+    report = read_report(tmp_path / "out")
+    assert report.runs.rmse.round(6).nunique() == 2
+    a, b = tmp_path / "out" / "a", tmp_path / "out" / "b"
+    line = f"2 finished in {a}: runs of {b} have the same choices and seeds, "
+    line += f"and are shown; gpmpc report {a} shows them"
+    assert notes(report) == {"Repeated": [line]}
+    assert notes(read_report(a)) == {}
+
+
+def test_a_setting_that_is_left_out_is_a_choice(tmp_path):
+    add(tmp_path / "tree", "convex", 0, 0.1)
+    without = ["seed=0", "~noise"]
+    made_up_run(tmp_path / "tree", without, SETTINGS, result=metrics_of(0.2))
+    plan(tmp_path / "tree", [["seed=0", "~noise"], ["seed=1", "~noise"]])
+    report = read_report(tmp_path / "tree")
+    assert (report.runs.state == "finished").sum() == 2
+    assert "left out" in report_document(report).markdown()
+    (command,) = report.commands()
+    assert command.endswith(f"'~noise' seed=1 folder={tmp_path / 'tree'}")
+
+
+def test_a_command_names_a_folder_as_hydra_reads_it(tmp_path):
+    for name in ("a,b", "x(1)", "it's", "plain-1.5", "nul", "ü"):
+        tree = tmp_path / name
+        plan(tree, [["seed=1"], ["seed=2"]])
+        add(tree, "convex", 1, 0.1)
+        (command,) = read_report(tree).commands()
+        *_, word = shlex.split(command)
+        assert read_override(word).value == str(tree)
+    for name in ("1", "1e5", ".5", "true", "null", "inf"):
+        assert read_override(folder_override(Path(name))).value == name
