@@ -17,6 +17,7 @@ from statistics import median
 
 from omegaconf.errors import OmegaConfBaseException
 
+from gpmpc._provenance import provenance
 from gpmpc.cli._composing import ComposedSettings
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.studies._run_folder import Busy, RunFolder
@@ -70,7 +71,7 @@ def fly_chunk(chunk: Chunk) -> None:
     Those that another process works on are left to it.
 
     Raises:
-        GpmpcError: Runs could not be begun, for reasons that their folders do not hold.
+        GpmpcError: Runs could not be begun, for reasons that their folders cannot hold.
     """
     began = time.monotonic()
     problems: dict[str, None] = {}
@@ -80,7 +81,8 @@ def fly_chunk(chunk: Chunk) -> None:
         except Busy:
             continue
         except (GpmpcError, OmegaConfBaseException) as error:
-            problems[" ".join(str(error).split())] = None
+            if not _fail(job, error):
+                problems[" ".join(str(error).split())] = None
         work = time.monotonic() - began
         if chunk.most_work is not None and work > chunk.most_work:
             break
@@ -102,6 +104,25 @@ def _fly_job(job: Job) -> None:
     )
     with report_compilation():
         run_one(to_fly, wait=False)
+
+
+def _fail(job: Job, error: Exception) -> bool:
+    """Keeps why a run could not be begun; returns whether its folder holds it."""
+    about = {
+        "schema": 1,
+        "choices": job.choices,
+        "settings": {},
+        "provenance": provenance(),
+    }
+    try:
+        with job.folder.locked(wait=False):
+            if not job.folder.finished:
+                job.folder.fail(error, about)
+    except Busy:  # what becomes of the run, the other process says
+        return True
+    except OSError:
+        return False
+    return True
 
 
 class Chunking:

@@ -85,6 +85,10 @@ def try_settings(settings: Sequence[ComposedSettings]) -> None:
         for each in settings:
             try:
                 experiment_of(each.config())
+            except SystemExit as error:
+                raise GpmpcError(
+                    f"code that the settings call ended the process (exit {error.code})"
+                ) from error
             except Exception as error:
                 message = explain(error, "run")
                 if message is None:

@@ -179,6 +179,8 @@ class Flying:
     def _lose(self, job: Job, end: ChunkEnd) -> None:
         """Makes a job a failed one, or leaves it to be flown again."""
         cause = end.cause or Cause.ERROR
+        # What ends a whole chunk says nothing of runs that were not begun.
+        is_attempt = cause not in _OF_THE_WHOLE_CHUNK or self._begun_now(job)
         about = {
             "schema": 1,
             "choices": [*job.choices],
@@ -187,7 +189,7 @@ class Flying:
             "provenance": self._provenance,
         }
         try:
-            job.folder.lose(end.reason, cause.value, about)
+            job.folder.lose(end.reason, cause.value, about, is_attempt)
         except Busy:  # another sweep works on it: its outcome counts
             return
         except OSError as error:

@@ -153,7 +153,7 @@ class Basic:
         for chunk in chunks:
             try:
                 work(chunk)
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 yield _end_by(error, chunk)
             else:
                 yield ChunkEnd(chunk, socket.gethostname())
@@ -232,7 +232,7 @@ class Joblib:
                         executor.shutdown(wait=False, kill_workers=True)
                     else:
                         self._idle.append(executor)
-                    if isinstance(error, Exception):
+                    if error is not None:
                         yield _end_by(error, chunk)
                     else:
                         yield ChunkEnd(chunk, socket.gethostname())
@@ -251,7 +251,7 @@ def _new_executor() -> ProcessPoolExecutor:
     return ProcessPoolExecutor(1, initializer=end_with, initargs=(os.getpid(),))
 
 
-def _end_by(error: Exception, chunk: Chunk) -> ChunkEnd:
+def _end_by(error: BaseException, chunk: Chunk) -> ChunkEnd:
     """Returns how a chunk on this machine ended by an exception."""
     host = socket.gethostname()
     text = " ".join(str(error).split())

@@ -15,6 +15,8 @@ from gpmpc.exceptions import SettingError
 # Hydra's parser reads such a word as it stands; it takes a tenth of a millisecond.
 _WHOLE_NUMBER = re.compile(r"([a-z_][\w.]*)=(0|-?[1-9][0-9]{0,17})", re.ASCII)
 
+_OF_HYDRA = ("hydra.", "hydra/")  # beginnings of the names of Hydra's own settings
+
 
 @dataclass(frozen=True)
 class Override:
@@ -32,17 +34,17 @@ class Override:
     @property
     def name(self) -> str:
         """The setting or group, without sign and package."""
-        return self.key.lstrip("+~").partition("@")[0]
+        return _name_of(self.key)
 
     @property
     def is_of_hydra(self) -> bool:
         """Whether it is of Hydra's own settings."""
-        return self.name.startswith(("hydra.", "hydra/"))
+        return self.name.startswith(_OF_HYDRA)
 
     @property
     def is_aside(self) -> bool:
         """Whether no result depends on it."""
-        return self.key in ASIDE or self.is_of_hydra
+        return is_shared(self.key)
 
 
 @lru_cache(maxsize=10_000)
@@ -75,6 +77,17 @@ def read_override(word: str) -> Override:
     )
 
 
+def is_shared(key: str) -> bool:
+    """Whether all runs of a sweep have the same value of a setting, signs aside."""
+    name = _name_of(key)
+    return name in ASIDE or name.startswith(_OF_HYDRA)
+
+
+def _name_of(key: str) -> str:
+    """Returns the setting or group of a key, without its sign and its package."""
+    return key.lstrip("+~").partition("@")[0]
+
+
 def choices(overrides: Iterable[str]) -> list[str]:
     """Returns what distinguishes a run, ``key=value`` each in Hydra's own spelling.
 
@@ -94,7 +107,8 @@ def combinations(overrides: Sequence[str]) -> Iterator[list[str]]:
     Of a key given twice, the last one counts.
 
     Raises:
-        SettingError: A setting has no value to sweep over.
+        SettingError: A setting has no value to sweep over, or several, and is one that
+            all runs share.
     """
     by_key: dict[str, list[str]] = {}
     for override in OverridesParser.create().parse_overrides([*overrides]):
@@ -105,5 +119,8 @@ def combinations(overrides: Sequence[str]) -> Iterator[list[str]]:
         values = [*override.sweep_string_iterator()]
         if not values:
             raise SettingError(key, "holds no value to sweep over")
+        if is_shared(key) and len(values) > 1:
+            got = ", ".join(map(str, values))
+            raise SettingError(key, f"is one for all runs of a sweep; got {got}")
         by_key[key] = [f"{key}={value}" for value in values]
     return map(list, itertools.product(*by_key.values()))

@@ -163,6 +163,8 @@ def run_one(
 ) -> Outcome:
     """Flies one run unless its folder is finished; an error is kept in the folder.
 
+    So is the end of the process (``sys.exit``) that code of the user's asked for.
+
     One with a live view flies again; its folder is not finished from then on until it
     is again.
 
@@ -194,7 +196,9 @@ def run_one(
             with one_thread(), remarks_to(remarks.append):
                 result = header | _fly(to_fly, yaml_text, warn)
             folder.finish(result)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
+            if hasattr(error, "ray_terminate_msg"):  # Ray ends this process
+                raise
             if _was_interrupted(error):
                 raise KeyboardInterrupt from error
             folder.fail(error, header)

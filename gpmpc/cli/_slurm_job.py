@@ -18,7 +18,7 @@ def main() -> None:
         find_modules_here()
         content = pickle.loads((Path(folder) / CHUNKS).read_bytes())
         content["work"](pickle.loads(content["chunks"][int(index)]))
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         traceback.print_exc()
         print_error(f"error: {type(error).__name__}: {' '.join(str(error).split())}")
         sys.exit(1)

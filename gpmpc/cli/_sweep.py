@@ -15,6 +15,7 @@ import hashlib
 import itertools
 import json
 import shlex
+import threading
 from argparse import Namespace
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -36,7 +37,7 @@ from gpmpc.cli._overrides import choices, combinations
 from gpmpc.cli._plain_settings import plain_settings
 from gpmpc.cli._settings import search_options
 from gpmpc.cli._terminal import print_error, progress_bar
-from gpmpc.exceptions import check_number
+from gpmpc.exceptions import SettingError, check_number
 from gpmpc.studies._index import RunIndex
 from gpmpc.studies._run_folder import (
     METRICS,
@@ -203,12 +204,30 @@ class Sweep:
         if state is RunState.FAILED:
             return JobOutcome(str(folder), job.folder.error())
         result = job.folder.result()
-        self._add_to_index(folder / METRICS, result, job.settings.fingerprint())
+        fingerprint = self._compared_fingerprint(job)
+        self._add_to_index(folder / METRICS, result, fingerprint)
         self._index.write()
         warning = warning_of(result)
         if warning is not None:
             self.warnings[folder] = warning
         return JobOutcome(str(folder))
+
+    def _compared_fingerprint(self, job: Job) -> str | None:
+        """Returns the fingerprint of a job's settings if its finished run has them.
+
+        Else None, and a line says so: the file of a model was written anew while the
+        sweep flew, or another sweep of other settings finished the run.
+        """
+        fingerprint = job.settings.fingerprint()
+        if fingerprint is None:
+            return None
+        try:
+            settings = plain_settings(job.settings.config(), job.settings.options)
+            job.folder.result(settings)
+        except SettingError as error:
+            print_error(str(error))
+            return None
+        return fingerprint
 
     @contextmanager
     def progress(
@@ -263,6 +282,8 @@ class Sweep:
 class _Ends:
     """Counts the runs that have ended, with a few looks at a time.
 
+    The thread that draws the bar counts, too, while this one looks at all.
+
     Args:
         jobs: The runs: the caller's list, which may grow.
     """
@@ -272,15 +293,18 @@ class _Ends:
         self._taken = 0  # of the jobs
         self._open: deque[Job] = deque()
         self._ended = 0
+        self._lock = threading.Lock()
 
     def count(self) -> int:
         """Returns how many are known to have ended; looks at some of the others."""
-        self._look(_LOOKS)
-        return self._ended
+        with self._lock:
+            self._look(_LOOKS)
+            return self._ended
 
     def look_at_all(self) -> None:
         """Looks at every run that is not known to have ended."""
-        self._look(len(self._jobs))
+        with self._lock:
+            self._look(len(self._jobs))
 
     def _look(self, most: int) -> None:
         added = self._jobs[self._taken :]

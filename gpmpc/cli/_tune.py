@@ -22,7 +22,7 @@ from gpmpc.cli._chunks import Job
 from gpmpc.cli._commands import Result
 from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import write_files
-from gpmpc.cli._overrides import choices
+from gpmpc.cli._overrides import choices, is_shared
 from gpmpc.cli._settings import run_command, search_options, without_hydra
 from gpmpc.cli._sweep import JobOutcome, Sweep, print_failed
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, check_number
@@ -162,7 +162,7 @@ def _space(
         if not override.is_sweep_override():
             fixed.append(str(override.input_line))
             continue
-        if key in ("seed", "folder", "launcher"):
+        if key == "seed" or is_shared(key):
             raise SettingError(key, "cannot be searched; seeds are many by --seeds")
         if override.is_interval_sweep():
             space[key] = _interval(key, override)

@@ -215,13 +215,16 @@ class RunFolder:
         }
         write_whole(self.path / ERROR, json.dumps(content, indent=1) + "\n")
 
-    def lose(self, reason: str, kind: str, about: Mapping[str, Any]) -> None:
+    def lose(
+        self, reason: str, kind: str, about: Mapping[str, Any], is_attempt: bool = True
+    ) -> None:
         """Keeps why an attempt ended that could not say so itself.
 
         Args:
             reason: In a line.
             kind: Such as "time" or "memory".
             about: What else is kept, such as the choices.
+            is_attempt: Whether it counts among ``lost_attempts``.
 
         Raises:
             Busy: A process works on the run, so that it is not lost.
@@ -233,7 +236,7 @@ class RunFolder:
                 **about,
                 "error": " ".join(reason.split()),
                 "kind": kind,
-                "attempts": self.lost_attempts + 1,
+                "attempts": self.lost_attempts + is_attempt,
                 "traceback": "",
             }
             write_whole(self.path / ERROR, json.dumps(content, indent=1) + "\n")

@@ -1,10 +1,15 @@
 """Runs of a sweep in chunks: how many a process flies, and which are tried before."""
 
+import errno
 import logging
 import os
+import re
+import threading
+from types import SimpleNamespace
 
 import hydra
 import pytest
+from rich.console import Console
 
 from gpmpc.cli import _run
 from gpmpc.cli._chunks import Chunk, Chunking, Job, fly_chunk
@@ -12,8 +17,11 @@ from gpmpc.cli._composing import Composer
 from gpmpc.cli._examples import Examples
 from gpmpc.cli._overrides import choices, combinations
 from gpmpc.cli._settings import settings
+from gpmpc.cli._sweep import Sweep, _Ends
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
+from gpmpc.studies._index import RunIndex
 from gpmpc.studies._run_folder import Busy, RunFolder, RunState, folder_name
+from tests.studies.made_up import metrics_of
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -102,16 +110,43 @@ def test_a_chunk_goes_on_behind_what_cannot_be_flown(tmp_path, monkeypatch):
         if seed == 1:
             raise Busy("another process works on this run")
         if seed in (2, 3):
-            raise SettingError("folder", "cannot write")
+            raise SettingError("model.path", "cannot read m")
 
     monkeypatch.setattr(_run, "run_one", run)
-    with pytest.raises(GpmpcError) as told:
-        fly_chunk(Chunk(tuple(jobs), None))
+    fly_chunk(Chunk(tuple(jobs), None))
     assert flown == [0, 1, 2, 3, 4]
-    assert str(told.value) == "folder: cannot write"
+    states = [job.folder.state for job in jobs]
+    assert states == [RunState.NOT_BEGUN] * 2 + [RunState.FAILED] * 2 + states[:1]
+    assert jobs[2].folder.error() == "model.path: cannot read m"
+    assert jobs[2].folder.lost_attempts == 0
     flown.clear()
-    fly_chunk(Chunk(tuple(jobs[:1]) + tuple(jobs[4:]), most_work=0.0))
-    assert flown == [0]  # it always flies one
+    fly_chunk(Chunk(tuple(jobs[2:]), most_work=0.0))
+    assert flown == [2]  # it always flies one
+
+    def refuse(*arguments):
+        raise OSError(errno.ENOSPC, "disk full")
+
+    monkeypatch.setattr(RunFolder, "fail", refuse)
+    with pytest.raises(GpmpcError, match=r"\Amodel.path: cannot read m\Z"):
+        fly_chunk(Chunk(tuple(jobs), None))
+
+
+class Death(BaseException):
+    """As if the process died."""
+
+
+def test_a_flight_that_ends_its_process_has_failed(tmp_path, monkeypatch):
+    jobs = jobs_of(tmp_path, "seed=range(2)")
+
+    def flight(run, *_):
+        if run.config.seed == 0:
+            raise SystemExit(2)
+        return {}
+
+    monkeypatch.setattr(_run, "_fly", flight)
+    fly_chunk(Chunk(tuple(jobs), None))
+    assert [job.folder.state for job in jobs] == [RunState.FAILED, RunState.FINISHED]
+    assert jobs[0].folder.error() == "2"
 
 
 def test_remarks_stay_with_a_run_whatever_becomes_of_its_chunk(
@@ -127,11 +162,11 @@ def test_remarks_stay_with_a_run_whatever_becomes_of_its_chunk(
         if run.config.seed == 1:
             raise DataError("no rows")
         if run.config.seed == 2:
-            raise SystemExit("as if the process died")
+            raise Death
         return {}
 
     monkeypatch.setattr(_run, "_fly", flight)
-    with pytest.raises(SystemExit):
+    with pytest.raises(Death):
         fly_chunk(Chunk(tuple(jobs), None))
     states = [job.folder.state for job in jobs]
     assert states == [RunState.FINISHED, RunState.FAILED, RunState.LOST]
@@ -154,3 +189,53 @@ def test_every_choice_and_both_ends_are_tried(tmp_path):
     assert examples.of(jobs) == []
     later = jobs_of(tmp_path, "seed=300,7")
     assert [job.choices for job in Examples().of(later)] == [["seed=300"], ["seed=7"]]
+
+
+@pytest.mark.parametrize("content", [b"1", b"2"], ids=["same", "changed"])
+def test_a_sweep_remembers_only_the_settings_that_a_run_has(
+    content, tmp_path, monkeypatch, capsys
+):
+    model = tmp_path / "model.safetensors"
+    model.write_bytes(b"1")
+    words = ["model=saved", f"model.path={model}", f"folder={tmp_path / 'tree'}"]
+
+    def flight(*_):
+        model.write_bytes(content)
+        return metrics_of(0.1)
+
+    monkeypatch.setattr(_run, "_fly", flight)
+    runs = Sweep("run", words, Console(quiet=True))
+    job = runs.job(words)
+    assert [outcome.error for outcome in runs.fly([job])] == [None]
+    path = job.folder.path / "metrics.json"
+    known = RunIndex(tmp_path / "tree").record_with(path, job.settings.fingerprint())
+    assert (known is not None) == (content == b"1")
+    assert ("of other settings (model.sha256" in capsys.readouterr().err) == (
+        content == b"2"
+    )
+
+
+def test_the_bar_may_look_while_all_are_looked_at():
+    def bar_looks():
+        bar = threading.Thread(target=ends.count)
+        bar.start()
+        bar.join(0.1)
+        return True
+
+    class First:
+        @property
+        def done(self):
+            return bar_looks()
+
+    ends = _Ends([First(), SimpleNamespace(done=True), SimpleNamespace(done=True)])
+    ends.look_at_all()
+    assert ends.count() == 3
+
+
+@pytest.mark.parametrize(
+    "word", ["folder=a,b", "launcher=basic,joblib", "+hydra.job.x=1,2", "++chunk=1,2"]
+)
+def test_what_all_runs_share_has_one_value(word):
+    key = re.escape(word.partition("=")[0])
+    with pytest.raises(SettingError, match=rf"\A{key}: is one for all runs"):
+        combinations(["seed=1,2", word])

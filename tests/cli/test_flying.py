@@ -59,6 +59,11 @@ def begins(chunk):
     chunk.folders[0].begin("act: 1\n")
 
 
+def begins_again(chunk):
+    with chunk.folders[0].locked():
+        chunk.folders[0].begin("act: 1\n")
+
+
 def test_a_chunk_that_is_said_to_be_done_and_is_not_there_has_failed(
     tmp_path, monkeypatch
 ):
@@ -71,7 +76,7 @@ def test_a_chunk_that_is_said_to_be_done_and_is_not_there_has_failed(
     assert error["choices"] == ["act=flies"]
     assert error["host"] == "blind (10.0.0.7)"
     assert error["error"].startswith("blind (10.0.0.7) says that it flew this run, and")
-    assert error["attempts"] == 1
+    assert error["attempts"] == 0  # it never began
 
 
 def test_a_run_that_nobody_can_write_down_has_failed(tmp_path, monkeypatch):
@@ -133,6 +138,11 @@ def test_what_concerns_a_whole_chunk_fails_all_that_is_left_of_it(cause, tmp_pat
         "3-flies": "finished",
     }
     assert error_of(jobs[2])["error"] == "no"
+    # Those that never began may be flown again as often as anybody likes.
+    assert error_of(jobs[2])["attempts"] == 0
+    begun = {"cause": cause, "reason": "no", "before": begins_again}
+    flown(Told(tmp_path, begun), jobs[2:3])
+    assert error_of(jobs[2])["attempts"] == 1
 
 
 @pytest.mark.parametrize("cause", [Cause.NODE, Cause.CRASH])
@@ -208,6 +218,8 @@ def test_a_process_of_joblib_that_dies_takes_one_chunk_with_it(tmp_path):
     jobs = jobs_of(tmp_path, "dies", "flies", "dies once", "flies", "flies", "raises")
     launcher = Joblib(tmp_path, n_jobs=2)
     flying, states = flown(launcher, jobs, size=2, retries=1)
+    (end,) = launcher.launch(ends_its_process, in_chunks(1)(jobs[:1]))
+    assert (end.cause, end.reason) == (Cause.ERROR, "SystemExit: 2")
     # Those that wait may die as well, such as for want of memory.
     for executor in launcher._idle:
         (process,) = executor._processes.values()
@@ -235,6 +247,10 @@ def test_a_process_of_joblib_that_dies_takes_one_chunk_with_it(tmp_path):
 def test_a_number_of_processes_must_be_one(wrong, tmp_path):
     with pytest.raises(SettingError, match=r"hydra\.launcher\.n_jobs.* must be"):
         Joblib(tmp_path, n_jobs=wrong)
+
+
+def ends_its_process(chunk):
+    raise SystemExit(2)
 
 
 DRIVER = """
