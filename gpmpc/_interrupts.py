@@ -1,4 +1,4 @@
-"""Delays Ctrl-C until a solve of CasADi has ended.
+"""Delays Ctrl-C until a solve of CasADi, or the writing of a chunk, has ended.
 
 CasADi does not pass a Ctrl-C during a solve on: IPOPT stops, and its caller goes on
 with the last iterate, so that a flight would continue with a failed solve and a

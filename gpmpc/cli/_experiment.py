@@ -63,12 +63,15 @@ def experiment_of_file(settings: dict[str, Any], trusted: Sequence[str]) -> Expe
 
 
 def _merge(config: DictConfig) -> DictConfig:
-    """Checks settings and completes their parts, each as it will be called.
-
-    A nominal system and a plant are whole systems, the controller has its propagator
-    and its solver.
-    """
+    """Checks settings and completes their parts, each as it will be called."""
     _check(config)
+    _complete_systems(config)
+    _choose_parts(config)
+    return config
+
+
+def _complete_systems(config: DictConfig) -> None:
+    """Makes whole systems of what a nominal system and a plant differ in."""
     with open_dict(config):
         nominal = config.nominal
         if nominal and "_target_" not in nominal:
@@ -79,15 +82,26 @@ def _merge(config: DictConfig) -> DictConfig:
             if value != config.system.get(key)
         }
         config.plant = OmegaConf.merge(config.system, changes) if changes else None
-        for group, argument in (("propagation", "propagator"), ("solver", "solver")):
-            if not config.get(group):
-                continue
-            if argument not in config.controller:
-                raise SettingError(
-                    group, "this controller has none to choose; leave it out"
-                )
+
+
+def _choose_parts(config: DictConfig) -> None:
+    """Gives the controller the propagator and the solver that are chosen beside it."""
+    for group, argument in (("propagation", "propagator"), ("solver", "solver")):
+        if not config.get(group):
+            continue
+        if argument not in config.controller:
+            raise SettingError(
+                group, "this controller has none to choose; leave it out"
+            )
+        own = config.controller[argument]
+        if isinstance(own, str):
+            raise SettingError(
+                group,
+                f"this controller takes one by its name, as controller.{argument}="
+                f"{own}; got {config[group].get('_target_')}",
+            )
+        with open_dict(config):
             config.controller[argument] = config[group]
-    return config
 
 
 def _build(config: DictConfig) -> Experiment:

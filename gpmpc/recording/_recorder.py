@@ -11,6 +11,7 @@ import json
 import math
 import platform
 import time
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +23,7 @@ from foxglove.messages import Log, LogLevel, Timestamp
 
 from gpmpc._calls import explains_arguments
 from gpmpc._files import as_path
+from gpmpc._interrupts import interrupts_after
 from gpmpc._provenance import flattened, provenance
 from gpmpc.exceptions import RecordingError, check_kind, check_number
 from gpmpc.recording._encoding import Encoder, StepCopy
@@ -97,7 +99,7 @@ class McapRecorder:
         self._record_problems = record_problems
         self._chunk_size = chunk_size
         self._encoder = Encoder(system)
-        self._waiting: list[StepCopy] = []
+        self._waiting: deque[StepCopy] = deque()
         self._unsaved_bytes = 0  # of numbers, in the chunk under way
         self._steps = 0
         self._chunk_begins_at = -math.inf  # [s] of the flight
@@ -160,7 +162,8 @@ class McapRecorder:
         self._waiting.append(copy)
         self._unsaved_bytes += size
         if self._server is not None:
-            self._serialise()
+            with interrupts_after():
+                self._serialise()
         if self._is_chunk_due(step):
             self._end_chunk()
 
@@ -205,7 +208,14 @@ class McapRecorder:
         return time.perf_counter() - self._saved_at_clock > _LONGEST_WAIT
 
     def _end_chunk(self) -> None:
-        """Writes what waits, and behind it the topics of channels that are new."""
+        """Writes what waits, and behind it the topics of channels that are new.
+
+        A Ctrl-C waits for the end: half a chunk cannot be taken up again.
+        """
+        with interrupts_after():
+            self._write_chunk()
+
+    def _write_chunk(self) -> None:
         self._serialise()
         self._writer.flush()
         new_topics = topics_of_chunk(self._sink.unsaved, self._topics)
@@ -216,10 +226,16 @@ class McapRecorder:
         self._save()
 
     def _serialise(self) -> None:
-        """Logs the steps that wait: into the open chunk, and to viewers."""
-        for copy in self._waiting:
+        """Logs the steps that wait: into the open chunk, and to viewers.
+
+        What cannot be encoded waits no more: it would fail at each attempt.
+        """
+        while self._waiting:
+            copy = self._waiting.popleft()
             stamp = round(copy.step.time * 1e9)
-            for topic, encoded in self._encoder.encode(copy):
+            messages = list(self._encoder.encode(copy))
+            self._steps += 1
+            for topic, encoded in messages:
                 self._channels[topic].log(encoded, log_time=stamp)
             self._scene.log(copy, stamp)
             if copy.step.failed or not copy.status.solved:
@@ -229,8 +245,6 @@ class McapRecorder:
                 self._level = judgement.level
                 message = _judgement_log(copy.step, judgement, stamp)
                 self._log.log(message, log_time=stamp)
-        self._steps += len(self._waiting)
-        self._waiting.clear()
 
     def _save(self, sync: bool = False) -> None:
         """Saves what was written, so that it is safe if this process dies.

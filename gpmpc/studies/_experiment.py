@@ -225,6 +225,12 @@ class Experiment:
                 "learning",
                 "needs a controller that learns a model, and a plant in the loop",
             )
+        if isinstance(self.learning, EpisodicLearning) and self.model is not None:
+            raise SettingError(
+                "learning",
+                "episodes train their models; leave out the one that was trained "
+                f"before, model=FILE; got {type(self.model).__name__}",
+            )
 
     def _check_plant(self) -> None:
         """Raises, before a training, where noise or disturbances do not fit."""

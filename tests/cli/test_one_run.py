@@ -1,16 +1,23 @@
 """One run in its folder: flown again to be watched, and files that cannot be read."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from hydra.core.hydra_config import HydraConfig
 
 from gpmpc.cli import _run
+from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import writing
 from gpmpc.cli._run import RunSettings, run_one
 from gpmpc.cli._settings import compose, settings
 from gpmpc.exceptions import SettingError
+from gpmpc.mpc import Box
+from gpmpc.recording import read_run
 from gpmpc.studies._run_folder import RunFolder, RunState
+from gpmpc.step import Step
+from gpmpc.systems import translational
 
 
 def to_fly(tree, *overrides):
@@ -72,3 +79,41 @@ def test_only_errors_of_a_folder_are_those_of_writing_to_it(tmp_path):
         folder.mkdir(parents=True)
     with pytest.raises(FileNotFoundError, match="data.csv"), writing(folder):
         Path(tmp_path / "data.csv").read_text()
+
+
+def test_a_controller_that_names_its_solver_takes_no_other(tmp_path):
+    config = to_fly(tmp_path, "controller=state_form", "solver=clarabel").config
+    said = r"\Asolver: .* by its name, as controller.solver=CLARABEL"
+    with pytest.raises(SettingError, match=said):
+        experiment_of(config)
+
+
+def test_a_recording_tells_how_many_points_a_saved_model_has(tmp_path):
+    run = to_fly(tmp_path)
+    plant = translational()
+    experiment = SimpleNamespace(
+        system=plant,
+        model=range(7),
+        learning=None,
+        seed=0,
+        unplanned_noise=lambda training: np.zeros(6),
+    )
+    bounds = Box(np.zeros(3), np.ones(3))
+    controller = SimpleNamespace(problem=SimpleNamespace(inputs=bounds), horizon=2)
+    nothing = np.zeros(6)
+    step = Step(
+        time=0.0,
+        k=0,
+        reference=nothing,
+        state=nothing,
+        measured=nothing,
+        input=np.zeros(3),
+        decision=None,
+        innovation=nothing,
+        belief_covariance=np.zeros((6, 6)),
+    )
+    recordings = _run._Recordings(experiment, run, "")
+    with recordings.open_next(controller, None) as on_step:
+        on_step(step)
+    recorded = read_run(tmp_path / "run" / "run.mcap")
+    assert recorded.gp_sizes.tolist() == [7]

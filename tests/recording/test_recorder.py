@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import re
 import resource
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -553,3 +554,45 @@ def test_two_processes_recording_into_one_tree_lose_nothing(tmp_path):
     assert all(
         read_run(file).finished and len(read_run(file).times) == 20 for file in files
     )
+
+
+def test_an_interrupted_chunk_is_written_once(tmp_path):
+    rng = np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    recorder = runs.recorder(path, chunk_size=10**6)
+    encode = recorder._encoder.encode
+
+    def interrupted(copy):
+        if copy.step.k == 2:
+            signal.raise_signal(signal.SIGINT)
+        return encode(copy)
+
+    recorder._encoder.encode = interrupted
+    with pytest.raises(KeyboardInterrupt), recorder:
+        for k in range(4):
+            recorder.record(runs.make_step(k, rng))
+        recorder.close()
+    run = read_run(path)
+    assert run.steps.tolist() == [0, 1, 2, 3]
+    assert run.finished
+
+
+def test_a_step_that_cannot_be_encoded_fails_once(tmp_path):
+    rng = np.random.default_rng(0)
+    path = tmp_path / "run.mcap"
+    recorder = runs.recorder(path, chunk_size=10**6)
+    encode = recorder._encoder.encode
+
+    def failing(copy):
+        if copy.step.k == 2:
+            raise ArithmeticError("of no use")
+        return encode(copy)
+
+    recorder._encoder.encode = failing
+    with pytest.raises(ArithmeticError), recorder:
+        for k in range(4):
+            recorder.record(runs.make_step(k, rng))
+        recorder.close()
+    run = read_run(path)
+    assert run.steps.tolist() == [0, 1, 3]
+    assert run.metadata["end"]["outcome"] == "ArithmeticError: of no use"
