@@ -1,11 +1,14 @@
 """The guides run as they stand: files are written, Python runs, commands succeed."""
 
 import shlex
+from argparse import Namespace
 
 import numpy as np
 import pandas
 import pytest
 
+from gpmpc.cli._new import new
+from gpmpc.exceptions import SettingError
 from tests.cli.command import forked
 from tests.pages import BLOCK, read
 
@@ -115,6 +118,20 @@ def test_a_new_project_runs_at_once(tmp_path, monkeypatch):
     names = {}
     exec(compile((project / "test_arm.py").read_text(), "test_arm.py", "exec"), names)
     names["test_it_is_held_at_its_goal"]()
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("pendulum", "pendulum is the name of a system of gpmpc"),
+        ("fly", "fly is the name of a file of the project"),
+        ("random", "random is the name of a module that Python finds already"),
+    ],
+)
+def test_a_project_takes_no_name_that_means_something_else(name, message, tmp_path):
+    with pytest.raises(SettingError, match=rf"\ANAME: {message}"):
+        new(Namespace(name=name, to=tmp_path / "project"))
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize(

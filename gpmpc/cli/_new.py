@@ -3,14 +3,17 @@
 import argparse
 import keyword
 import re
+from importlib.util import find_spec
 from pathlib import Path
 
 from gpmpc.cli._commands import Result
 from gpmpc.cli._folders import write_files
+from gpmpc.cli._settings import config_folder
 from gpmpc.exceptions import SettingError
 
 # Files, named and written for a system called NAME.
 _TEMPLATES = Path(__file__).with_name("project")
+_OTHER_MODULES = ("fly", "conftest")  # of the project, or of pytest in it
 _FILES = {
     "NAME.py": "system.txt",
     "system/NAME.yaml": "settings.txt",
@@ -43,9 +46,27 @@ def new(arguments: argparse.Namespace) -> Result:
 
 
 def _check_name(name: str) -> None:
-    """Raises where a name cannot be that of a module of Python."""
+    """Raises where a name is none of a module of Python, or means something else.
+
+    Of a file of settings gpmpc's own is found first, of a module the installed one.
+    """
     is_word = name.isidentifier() and name.isascii() and not name.startswith("_")
     if not is_word or keyword.iskeyword(name):
         raise SettingError(
             "NAME", f"must be letters, digits and _, a letter first; got {name!r}"
         )
+    owner = ""
+    if (config_folder() / "system" / f"{name}.yaml").exists():
+        owner = "a system of gpmpc"
+    elif name in _OTHER_MODULES:
+        owner = "a file of the project"
+    elif _is_module(name):
+        owner = "a module that Python finds already"
+    if owner:
+        raise SettingError("NAME", f"{name} is the name of {owner}; choose another")
+
+
+def _is_module(name: str) -> bool:
+    """Whether a module or package of some name is installed; a bare folder is none."""
+    spec = find_spec(name)
+    return spec is not None and spec.origin is not None

@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.console import Console
 
+from gpmpc._files import whole_file
 from gpmpc.cli._commands import Result
 from gpmpc.cli._folders import writing
 from gpmpc.cli._log import condition
@@ -60,7 +61,8 @@ def _plot(arguments: argparse.Namespace, path: Path, folder: Path) -> dict[str, 
         folder.mkdir(parents=True, exist_ok=True)
         for name, figure in figures.items():
             file = f"{name}.{arguments.format}"
-            figure.savefig(folder / file, dpi=150)
+            with whole_file(folder / file) as opened:
+                figure.savefig(opened, format=arguments.format, dpi=150)
             written.append(file)
         if animation is not None:
             for file in _animation_files():

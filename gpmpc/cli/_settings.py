@@ -41,6 +41,7 @@ def settings(own: str | None = None) -> Iterator[None]:
         folder = Path(own)
         if not folder.is_dir():
             raise SettingError("--config-dir", f"{folder}: no such folder")
+        check_own_folder(folder)
 
         class OwnFolder(SearchPathPlugin):
             def manipulate_search_path(self, search_path: Any) -> None:
@@ -51,6 +52,24 @@ def settings(own: str | None = None) -> Iterator[None]:
         version_base="1.3", config_dir=str(config_folder())
     ):
         yield
+
+
+def check_own_folder(folder: Path) -> None:
+    """Raises where a file of ``--config-dir`` would never be read.
+
+    The package's settings are found first, so that each file's name means the same
+    everywhere.
+    """
+    package_folder = config_folder()
+    for path in sorted(package_folder.rglob("*.yaml")):
+        name = path.relative_to(package_folder)
+        own = folder / name
+        if own.is_file() and own.read_bytes() != path.read_bytes():
+            raise SettingError(
+                "--config-dir",
+                f"{own} has the name of a file of gpmpc, which would be used in its "
+                "place; choose another name",
+            )
 
 
 def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:

@@ -114,7 +114,7 @@ class Slurm:
         array_parallelism: Jobs at the same time, at most.
         partition, account, qos, constraint: As for sbatch; None leaves them to Slurm.
         setup: Lines of shell before a job's command.
-        additional_parameters: Other options of sbatch, by name.
+        additional_parameters: Other options of sbatch, by name; true makes a flag.
     """
 
     workers = None
@@ -142,6 +142,12 @@ class Slurm:
         check_number(key + "array_parallelism", array_parallelism, least=1, whole=True)
         if isinstance(setup, str):
             raise SettingError(key + "setup", f"must be a list of lines; got {setup!r}")
+        if any(str(line).lstrip().startswith("#SBATCH") for line in setup):
+            raise SettingError(
+                key + "setup",
+                "holds #SBATCH, which would be ignored; options of sbatch are "
+                "additional_parameters",
+            )
         if shutil.which("sbatch") is None:
             raise SettingError(
                 "launcher", "slurm needs sbatch; start the sweep on a login node"
@@ -229,9 +235,7 @@ class Slurm:
             "open-mode": "append",
             "chdir": Path.cwd(),
         }
-        words = [
-            f"--{key}={value}" for key, value in options.items() if value is not None
-        ]
+        words = [word for key, value in options.items() for word in _option(key, value)]
         try:
             job = _sbatch(words, self._script(folder), name)
         except GpmpcError:
@@ -357,6 +361,13 @@ class Slurm:
         how = f" ({job.reason})" if job and job.reason else ""
         last_words = f"; its log ends: {_one_line(log)[-200:]!r}" if log.strip() else ""
         return f"died, and nobody says why{how}{last_words}"
+
+
+def _option(key: str, value: Any) -> list[str]:
+    """Returns an option of sbatch; true makes a flag, false and None leave it out."""
+    if value is None or value is False:
+        return []
+    return [f"--{key}"] if value is True else [f"--{key}={value}"]
 
 
 def _cause(job: _Job | None, log: str | None) -> Cause | None:

@@ -5,6 +5,7 @@ its plan with 2-sigma ellipses of the predicted positions, to scale. These are o
 smaller than the plan is long: how wide the tube is stands below, on an axis of its own.
 """
 
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from gpmpc._calls import explains_arguments
+from gpmpc._files import write_whole
 from gpmpc.exceptions import SettingError, UnsupportedModel
 from gpmpc.plotting._style import (
     DASHED,
@@ -92,7 +94,12 @@ def save_animation(
     animation = FuncAnimation(
         figure, draw, frames=frames, blit=False, cache_frame_data=False
     )
-    animation.save(str(path), writer_class(fps=_FRAME_RATE), dpi=_DPI)
+    path = Path(path)
+    # The writers know files by their names alone.
+    with tempfile.TemporaryDirectory() as folder:
+        draft = Path(folder, path.name)
+        animation.save(str(draft), writer_class(fps=_FRAME_RATE), dpi=_DPI)
+        write_whole(path, draft.read_bytes())
 
 
 @styled

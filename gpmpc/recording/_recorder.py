@@ -170,6 +170,8 @@ class McapRecorder:
     def close(self, outcome: str = COMPLETE) -> None:
         """Writes what waits and finishes the file; ``outcome`` is kept as metadata.
 
+        A Ctrl-C waits for the end of it.
+
         Raises:
             RecordingError: It could not be written; the file is left unfinished.
         """
@@ -177,13 +179,14 @@ class McapRecorder:
             return
         if self._error is not None:
             raise RecordingError(self._error)
-        self._end_chunk()
-        end = {"steps": str(self._steps), "outcome": outcome}
-        self._writer.write_metadata("end", end)
-        self._writer.close()
-        self._save(sync=True)
-        self._closed = True
-        self._stop_recording("the recording is closed")
+        with interrupts_after():
+            self._end_chunk()
+            end = {"steps": str(self._steps), "outcome": outcome}
+            self._writer.write_metadata("end", end)
+            self._writer.close()
+            self._save(sync=True)
+            self._closed = True
+            self._stop_recording("the recording is closed")
 
     def __enter__(self) -> "McapRecorder":
         return self
@@ -191,12 +194,19 @@ class McapRecorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, _: Any
     ) -> None:
-        if error is None or kind is None:
-            self.close()
+        if error is not None:
+            self._close_after(error)
             return
-        # A run that ended in an error has been recorded up to there.
+        try:
+            self.close()
+        except Exception as own_error:
+            self._close_after(own_error)
+            raise
+
+    def _close_after(self, error: BaseException) -> None:
+        """Finishes the file of a run that has been recorded up to an error."""
         with contextlib.suppress(RecordingError):  # most likely the same error
-            self.close(f"{kind.__name__}: {error}")
+            self.close(f"{type(error).__name__}: {error}")
 
     def _is_chunk_due(self, step: Step) -> bool:
         """Tells whether the steps that wait are to be written now."""

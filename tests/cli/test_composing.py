@@ -11,6 +11,7 @@ from gpmpc.cli import _settings
 from gpmpc.cli._composing import Composer
 from gpmpc.cli._overrides import choices, combinations
 from gpmpc.cli._settings import without_hydra
+from gpmpc.exceptions import SettingError
 
 MANY = [
     ["seed=3"],
@@ -157,3 +158,16 @@ def test_choices_are_in_hydras_own_spelling():
         "f=-7",
         "~d",
     ]
+
+
+def test_own_files_that_would_not_be_read_are_named(composing, tmp_path):
+    own = tmp_path / "own"
+    (own / "system").mkdir(parents=True)
+    content = (composing / "system" / "pendulum.yaml").read_bytes()
+    (own / "system" / "pendulum.yaml").write_bytes(content)
+    _settings.check_own_folder(own)
+    (own / "system" / "mine.yaml").write_bytes(b"mass: 2")
+    _settings.check_own_folder(own)
+    (own / "system" / "pendulum.yaml").write_bytes(content + b"# heavier")
+    with pytest.raises(SettingError, match=r"system/pendulum\.yaml has the name of"):
+        _settings.check_own_folder(own)

@@ -15,8 +15,8 @@ from gpmpc.cli._settings import compose, settings
 from gpmpc.exceptions import SettingError
 from gpmpc.mpc import Box
 from gpmpc.recording import read_run
-from gpmpc.studies._run_folder import RunFolder, RunState
 from gpmpc.step import Step
+from gpmpc.studies._run_folder import RunFolder, RunState
 from gpmpc.systems import translational
 
 

@@ -209,7 +209,7 @@ def test_jobs_are_submitted_as_arrays_that_slurm_takes(fake, tree):
         timeout_min=2,
         mem_gb=0.5,
         setup=["module load python"],
-        additional_parameters={"nice": 100},
+        additional_parameters={"nice": 100, "exclusive": True, "requeue": False},
     )
     names = [job.folder.path.name for job in jobs]
     states = outcomes(tree, jobs, size=2, launcher=launcher, flown_before=names)
@@ -219,7 +219,8 @@ def test_jobs_are_submitted_as_arrays_that_slurm_takes(fake, tree):
     for words, array in zip(asked, arrays, strict=True):
         assert array in words
         assert "--time=2 --mem=512M --cpus-per-task=1 --partition=gpu" in words
-        assert "--nice=100" in words
+        assert "--nice=100 --exclusive --job-name" in words
+        assert "requeue" not in words
         assert "None" not in words
         assert "signal" not in words
     script = (fake / "script").read_text().splitlines()
@@ -320,6 +321,7 @@ def test_a_busy_slurm_gets_an_array_once(answer, silent, fake, tree, monkeypatch
         ({"mem_gb": -1}, r"mem_gb: must be a number above 0"),
         ({"array_parallelism": 0.5}, r"array_parallelism: must be a whole number"),
         ({"setup": "module load x"}, r"setup.* must be a list of lines"),
+        ({"setup": ["#SBATCH --exclusive"]}, r"setup.* additional_parameters"),
     ],
 )
 def test_a_mistake_in_slurms_settings_is_named(arguments, words, fake, tree):

@@ -1,10 +1,15 @@
 """Figures of a recording show what was recorded, and nothing of what is lost."""
 
+from argparse import Namespace
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.animation import PillowWriter
+from matplotlib.figure import Figure
 
+from gpmpc.cli._plot import plot
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import animate, inputs_figure, timing_figure, tracking_figure
 from gpmpc.plotting._animation import FFMpegWriter, draw_flight
@@ -102,3 +107,32 @@ def test_a_film_as_mp4_needs_ffmpeg(run, tmp_path, monkeypatch):
     with pytest.raises(SettingError, match="an MP4 needs ffmpeg"):
         animate(run, tmp_path / "flight.mp4")
     assert not (tmp_path / "flight.mp4").exists()
+
+
+def killed(picture, file=None, **settings):
+    """Writes half of a picture."""
+    if file is None:
+        Path(picture.outfile).write_bytes(b"half of it")
+    else:
+        file.write(b"half of it")
+    raise KeyboardInterrupt
+
+
+def test_a_figure_is_whole_or_as_it_was(tmp_path, monkeypatch):
+    record_run(tmp_path / "run.mcap", steps=1)
+    (tmp_path / "tracking.png").write_bytes(b"old")
+    monkeypatch.setattr(Figure, "savefig", killed)
+    arguments = {"run": tmp_path / "run.mcap", "to": tmp_path, "format": "png"}
+    with pytest.raises(KeyboardInterrupt):
+        plot(Namespace(**arguments, film=False, no_animation=True))
+    assert (tmp_path / "tracking.png").read_bytes() == b"old"
+    assert not [*tmp_path.glob(".*.partial")]
+
+
+def test_an_animation_is_whole_or_as_it_was(tmp_path, monkeypatch):
+    record_run(tmp_path / "run.mcap", steps=1)
+    (tmp_path / "flight.gif").write_bytes(b"old")
+    monkeypatch.setattr(PillowWriter, "finish", killed)
+    with pytest.raises(KeyboardInterrupt):
+        animate(read_run(tmp_path / "run.mcap"), tmp_path / "flight.gif")
+    assert (tmp_path / "flight.gif").read_bytes() == b"old"

@@ -556,8 +556,14 @@ def test_two_processes_recording_into_one_tree_lose_nothing(tmp_path):
     )
 
 
-def test_an_interrupted_chunk_is_written_once(tmp_path):
+def record_four(recorder):
     rng = np.random.default_rng(0)
+    with recorder:
+        for k in range(4):
+            recorder.record(runs.make_step(k, rng))
+
+
+def test_an_interrupted_chunk_is_written_once(tmp_path):
     path = tmp_path / "run.mcap"
     recorder = runs.recorder(path, chunk_size=10**6)
     encode = recorder._encoder.encode
@@ -568,17 +574,14 @@ def test_an_interrupted_chunk_is_written_once(tmp_path):
         return encode(copy)
 
     recorder._encoder.encode = interrupted
-    with pytest.raises(KeyboardInterrupt), recorder:
-        for k in range(4):
-            recorder.record(runs.make_step(k, rng))
-        recorder.close()
+    with pytest.raises(KeyboardInterrupt):
+        record_four(recorder)
     run = read_run(path)
     assert run.steps.tolist() == [0, 1, 2, 3]
     assert run.finished
 
 
 def test_a_step_that_cannot_be_encoded_fails_once(tmp_path):
-    rng = np.random.default_rng(0)
     path = tmp_path / "run.mcap"
     recorder = runs.recorder(path, chunk_size=10**6)
     encode = recorder._encoder.encode
@@ -589,10 +592,8 @@ def test_a_step_that_cannot_be_encoded_fails_once(tmp_path):
         return encode(copy)
 
     recorder._encoder.encode = failing
-    with pytest.raises(ArithmeticError), recorder:
-        for k in range(4):
-            recorder.record(runs.make_step(k, rng))
-        recorder.close()
+    with pytest.raises(ArithmeticError):
+        record_four(recorder)
     run = read_run(path)
     assert run.steps.tolist() == [0, 1, 3]
     assert run.metadata["end"]["outcome"] == "ArithmeticError: of no use"
