@@ -17,8 +17,9 @@ what was learned. Where nothing was seen lately d is zero, and with one point it
 estimate of a constant disturbance.
 
 Each step of the flight becomes a point of the change, whether the change is used or
-not. The model with its change and the one without predict each step before they see it:
-the change is used once its log densities, summed over a window of steps, lead by a
+not, but for the first three, those at which all sensors repeat themselves, and those in
+doubt. The model with its change and the one without predict each step before they see
+it: the change is used once its log densities, summed over a window of steps, lead by a
 margin, and ceases to be used once they trail. The model's noise is scaled by what
 successive errors differ by, in the median, where that is more. A decision that fails
 with the change is taken without it.

@@ -29,7 +29,8 @@ class Doubt(NamedTuple):
     """A measurement that is held back until the next one explains it."""
 
     expected: Expectation  #: where the plant is if the measurement was wrong
-    noise_ratios: Array  #: of ``LearningState``, without the steps in doubt (w,)
+    #: ``noise_ratios`` of the ``LearningState`` before the steps in doubt (w,)
+    trusted_noise_ratios: Array
     #: the model whose change only the steps in doubt have taught, in case that the
     #: plant is another one; None where they teach nothing
     new_plant: ChangedModel | None
@@ -40,7 +41,11 @@ class Doubt(NamedTuple):
 
 @dataclass(frozen=True)
 class LearningState:
-    """What a flight has taught so far."""
+    """What a flight has taught so far.
+
+    Its model's time moves on once a step: every path through ``learn_from_step`` ends
+    in one ``later``, and a ``new_plant`` moves on where it is stored.
+    """
 
     model: ChangedModel  #: the model with its change
     state: Array  #: measured at the last step (n,)
@@ -53,7 +58,8 @@ class LearningState:
     #: by how much the log density with the change exceeds that without, of the last
     #: steps
     leads: Array
-    active: bool = False  #: whether the change is used
+    #: whether the leads speak for the change; ``planning`` says what plans
+    active: bool = False
     version: int = 0  #: how often the model that plans has changed
     #: steps that nothing has explained, less those that went as predicted since then
     unexplained_steps: int = 0
@@ -122,7 +128,9 @@ class LearningState:
     def without_doubt(self, doubt: Doubt) -> "LearningState":
         """Returns the state without the steps that were in doubt."""
         unknown = np.full_like(self.error, np.nan)
-        return replace(self, error=unknown, noise_ratios=doubt.noise_ratios, doubt=None)
+        return replace(
+            self, error=unknown, noise_ratios=doubt.trusted_noise_ratios, doubt=None
+        )
 
     def after_gap(self, state: Array) -> "LearningState":
         """Returns the state after steps without a measurement, at the next one (n,).

@@ -29,28 +29,28 @@ _PATIENCE = 2  # further confirmations for steps that nothing explained, at most
 
 @explains_arguments
 def learn_from_step(
-    learning: LearningState, input: Array, measured: Array
+    before: LearningState, input: Array, measured: Array
 ) -> LearningState:
     """Learns from one step of a flight.
 
     Args:
-        learning: What the steps before have taught, with the state measured last.
+        before: What the steps before have taught, with the state measured last.
         input: Applied in the step (m,).
         measured: State measured after it (n,).
     """
-    model = learning.model
+    model = before.model
     # Arrays of their own: callers may reuse theirs.
     input = np.array(input, dtype=float)
     measured = np.array(measured, dtype=float)
-    observed = model.error(learning.state, input, measured)
+    observed = model.error(before.state, input, measured)
     if not (np.abs(observed.error) < _ABSURD * np.sqrt(model.gp_noise)).all():
-        return learning.after_gap(measured)
-    noise_ratios = _with_noise_ratio(learning, observed.error)
-    seen = learning.with_measurement(measured, observed.error, noise_ratios)
+        return before.after_gap(measured)
+    noise_ratios = _with_noise_ratio(before, observed.error)
+    seen = before.with_measurement(measured, observed.error, noise_ratios)
     if len(noise_ratios) < _FEWEST_RATIOS:
         return seen.later()
     step = LearningStep(
-        state=learning.state,
+        state=before.state,
         input=input,
         next_state=measured,
         point=observed.point,
@@ -59,26 +59,32 @@ def learn_from_step(
         noise_variance=_noise_variance(noise_ratios, model),
     )
     comparison = model.compare(step)
-    if learning.doubt is not None:
-        return _resolve_doubt(seen, step, comparison, learning.doubt)
-    innovation = comparison.planned(learning.active)
+    if before.doubt is not None:
+        # Handed over beside ``seen``, whose it is: here it is known to be one.
+        return _resolve_doubt(seen, step, comparison, before.doubt)
+    innovation = comparison.planned(before.active)
     surprising = innovation.largest_square > model.learning.surprise
     if not surprising and not step.repeats.all():
         return _accept(seen, comparison)
-    expected = seen.expect(Expectation.certain(learning.state), step)
+    expected = seen.expect(Expectation.certain(before.state), step)
     if surprising or _is_frozen(seen, step, expected):
-        trusted = learning.noise_ratios  # those before this step
-        return _put_in_doubt(seen, step, comparison, expected, trusted)
+        return _put_in_doubt(
+            seen,
+            step,
+            comparison,
+            expected,
+            trusted_noise_ratios=before.noise_ratios,
+        )
     return seen.later()
 
 
-def _with_noise_ratio(learning: LearningState, error: Array) -> Array:
+def _with_noise_ratio(before: LearningState, error: Array) -> Array:
     """Returns the noise ratios (w,) with the one of a further error (k,)."""
-    squares = (error - learning.error) ** 2 / learning.model.gp_noise
+    squares = (error - before.error) ** 2 / before.model.gp_noise
     ratio = float(squares.mean()) / 2.0
     if not np.isfinite(ratio):
-        return learning.noise_ratios
-    return np.append(learning.noise_ratios, ratio)[-_MOST_RATIOS:]
+        return before.noise_ratios
+    return np.append(before.noise_ratios, ratio)[-_MOST_RATIOS:]
 
 
 def _noise_variance(noise_ratios: Array, model: ChangedModel) -> Array:
@@ -125,7 +131,7 @@ def _put_in_doubt(
     step: LearningStep,
     comparison: Comparison,
     expected: Expectation,
-    noise_ratios: Array,
+    trusted_noise_ratios: Array,
 ) -> LearningState:
     """Holds a measurement back that no prediction explains.
 
@@ -134,7 +140,7 @@ def _put_in_doubt(
         step: The step that led to it.
         comparison: Of the predictions of the step.
         expected: Where the plant is if all measurements in doubt are wrong.
-        noise_ratios: Those before the steps in doubt.
+        trusted_noise_ratios: Those before the steps in doubt.
     """
     settings = seen.model.learning
     if seen.doubt is None:
@@ -163,7 +169,7 @@ def _put_in_doubt(
         unexplained_steps=unexplained_steps,
         doubt=Doubt(
             expected=expected,
-            noise_ratios=noise_ratios,
+            trusted_noise_ratios=trusted_noise_ratios,
             new_plant=new_plant,
             confirmations_left=confirmations_left,
             steps_in_doubt=steps_in_doubt,
@@ -213,13 +219,13 @@ def _resolve_doubt(
     if_moved = comparison.planned(seen.active)
 
     density_to_beat = max(if_wrong.log_density, if_moved.log_density) + LARGEST_LEAD
-    new_plant = _confirm_new_plant(doubt, step, density_to_beat, settings)
+    new_plant = _new_plant_if_confirmed(doubt, step, density_to_beat, settings)
     if new_plant is not None and doubt.confirmations_left == 1:
         return _switch_plant(seen, new_plant)
     if new_plant is not None:
         confirmed = Doubt(
             expected=expected,
-            noise_ratios=doubt.noise_ratios,
+            trusted_noise_ratios=doubt.trusted_noise_ratios,
             new_plant=new_plant.later(1.0),
             confirmations_left=doubt.confirmations_left - 1,
             steps_in_doubt=doubt.steps_in_doubt + 1,
@@ -227,10 +233,10 @@ def _resolve_doubt(
         return _count_doubtful_lead(replace(seen, doubt=confirmed), comparison.lead)
     if min(if_moved.largest_square, if_wrong.largest_square) <= settings.surprise:
         return _count_doubtful_lead(seen.without_doubt(doubt), comparison.lead)
-    return _put_in_doubt(seen, step, comparison, expected, doubt.noise_ratios)
+    return _put_in_doubt(seen, step, comparison, expected, doubt.trusted_noise_ratios)
 
 
-def _confirm_new_plant(
+def _new_plant_if_confirmed(
     doubt: Doubt, step: LearningStep, density_to_beat: float, settings: OnlineLearning
 ) -> ChangedModel | None:
     """Returns the new plant of a doubt with a step that it explains; None otherwise.

@@ -3,6 +3,12 @@
 Outputs are linearised along a plan in z = [x_i; u_{i-1}], y(z') + J (z - z'), so that a
 step is one of Gauss-Newton. To a stage they add the square [z; 1]' Z [z; 1], where
 Z = [J, e]' W [J, e] and e = y(z') - J z' - c.
+
+A cost of the last state alone, of another form than ``Tracking.terminal``, is a
+``LeastSquares`` whose weights by stage are zero but the last one. A new field would go
+through ``StageCosts``, ``Problem.over``, ``_elastic``, ``StageMeter``, which leaves out
+what the end costs, the judge of flights, which knows ``Tracking`` alone, and
+``gpmpc/export/_problems.py``.
 """
 
 import inspect

@@ -44,7 +44,7 @@ _RELAY = 1e6  # gain of a relay, in ranges of the input per unit of a state
 
 
 @dataclass(frozen=True)
-class Flight:
+class ModelFlight:
     """A trajectory of the model, of as many stages as it takes, and its costs."""
 
     states: Array  #: x_0 .. x_L (L + 1, n)
@@ -62,7 +62,7 @@ class Flight:
         """Cost of all stages."""
         return float(self.costs.sum())
 
-    def is_better_than(self, other: "Flight") -> bool:
+    def is_better_than(self, other: "ModelFlight") -> bool:
         """Tells whether it alone arrives, or costs less.
 
         Where none arrives, both are held at their ends for as long as the longer takes.
@@ -77,9 +77,9 @@ class Flight:
     def _cost_over(self, length: int) -> float:
         return self.cost + float(self.costs[-1]) * (length - len(self))
 
-    def after(self, stages: int) -> "Flight":
+    def after(self, stages: int) -> "ModelFlight":
         """Returns what is left of it after some stages."""
-        return Flight(
+        return ModelFlight(
             states=self.states[stages:],
             inputs=self.inputs[stages:],
             costs=self.costs[stages:],
@@ -158,7 +158,7 @@ class Foresight:
 
     def fly(
         self, beginning: Trajectory, question: Question, limit: float = np.inf
-    ) -> Flight | None:
+    ) -> ModelFlight | None:
         """Flies along a trajectory, and on as its controller steers from its end.
 
         The flight ends where the goal is held, where the plant stands still, or where
@@ -181,7 +181,7 @@ class Foresight:
                 return None
         return None
 
-    def prolong(self, flight: Flight, question: Question) -> Flight:
+    def prolong(self, flight: ModelFlight, question: Question) -> ModelFlight:
         """Returns a flight and a horizon more, as the controller steers from its end.
 
         It is the flight itself where the controller fails.
@@ -233,8 +233,12 @@ class Foresight:
                 yield states[: last + 2], inputs[: last + 1]
 
     def follow(
-        self, flight: Flight, state: Array, question: Question, dearest: float = 0.0
-    ) -> Flight:
+        self,
+        flight: ModelFlight,
+        state: Array,
+        question: Question,
+        dearest: float = 0.0,
+    ) -> ModelFlight:
         """Returns a flight under its feedback, from another state at its beginning.
 
         For ``dearest`` see ``arrives``.
@@ -248,7 +252,7 @@ class Foresight:
         if np.isfinite(states).all():
             costs = self.meter(states, inputs, question)
             arrives = self.arrives(costs, dearest)
-        return Flight(
+        return ModelFlight(
             states=states,
             inputs=inputs,
             costs=costs,
@@ -289,7 +293,7 @@ class Foresight:
         )
         return rolled_states[0], rolled_inputs[0]
 
-    def with_gains(self, flight: Flight, question: Question) -> Flight:
+    def with_gains(self, flight: ModelFlight, question: Question) -> ModelFlight:
         """Returns a flight with the gains of the regulator of its own stages.
 
         Outputs weigh as they do along it.
@@ -323,11 +327,11 @@ class Foresight:
 
     def improve(
         self,
-        flight: Flight,
+        flight: ModelFlight,
         question: Question,
         rounds: int = _ROUNDS,
         programs: int = _PROGRAMS,
-    ) -> Flight:
+    ) -> ModelFlight:
         """Returns a cheaper flight from programs over all of its stages.
 
         It is the flight itself where there is none.
@@ -359,7 +363,7 @@ class Foresight:
             if not plan.applicable:
                 break
             no_gains = np.zeros((length, *np.shape(plan.inputs)[1:], len(state)))
-            planned = Flight(
+            planned = ModelFlight(
                 states=plan.means,
                 inputs=plan.inputs,
                 costs=flight.costs,
@@ -434,10 +438,10 @@ class _GrowingFlight:
         self._plan = plan
         return True
 
-    def flight(self) -> Flight:
+    def flight(self) -> ModelFlight:
         """Returns what was flown so far."""
         costs = np.array(self._costs)
-        return Flight(
+        return ModelFlight(
             states=np.array(self._states),
             inputs=np.array(self._inputs),
             costs=costs,

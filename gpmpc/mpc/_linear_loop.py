@@ -226,10 +226,16 @@ def _laws(A: Array, B: Array, cost: QuadraticCost, horizon: int) -> list[_Law]:
     )
     effect = np.vstack([B, np.zeros((n, m)), np.eye(m)])
     squares = _of_stages(cost.squares, horizon)
-    weights = _of_stages(cost.state[:, 0], horizon)
-    weights = np.stack([_wide(Q, squares[i : i + 1]) for i, Q in enumerate(weights)])
-    if len(weights) > 1:  # from those of s_1 .. s_{H-1} to those of s_0 .. s_{H-1}
-        weights = np.concatenate([weights[:1], weights[:-1]])
+    # The cost weighs s_1 .. s_{H-1}, the regulator s_0 .. s_{H-1}.
+    weights_of_next = np.stack(
+        [
+            _wide(Q, squares[i : i + 1])
+            for i, Q in enumerate(_of_stages(cost.state[:, 0], horizon))
+        ]
+    )
+    weights = weights_of_next
+    if len(weights_of_next) > 1:
+        weights = np.concatenate([weights_of_next[:1], weights_of_next[:-1]])
     gains = finite_horizon_lqr.unchecked(
         transition[None],
         effect[None],

@@ -30,7 +30,7 @@ from gpmpc.mpc._controller import (
     Reference,
     check_arguments,
 )
-from gpmpc.mpc._foresight import Flight, Foresight, Trajectory, finite_costs
+from gpmpc.mpc._foresight import Foresight, ModelFlight, Trajectory, finite_costs
 from gpmpc.mpc._linear_quadratic import References, evaluate_cost
 from gpmpc.mpc._linearization import StageCosts, StageLinearizer
 from gpmpc.mpc._question import Question
@@ -71,7 +71,7 @@ class _Situation(NamedTuple):
         return self.reference.states[-1]
 
 
-class _Memory(NamedTuple):
+class _Pursuit(NamedTuple):
     """What a decision on the way to a set point leaves for the next one.
 
     What is compared later leaves out stages beyond a hard bound, whose costs are
@@ -84,11 +84,13 @@ class _Memory(NamedTuple):
     dearest: float  # of the stages so far
     age: int  # decisions since it was found
     costs: Array  # of the stages of the plan (H,)
-    flight: Flight | None  # from this decision on; None where the controller took over
+    flight: (
+        ModelFlight | None
+    )  # from this decision on; None where the controller took over
     arrives: bool = True  # whether it holds the goal in the end
 
     @classmethod
-    def of_plan(cls, goal: Array, costs: Array) -> "_Memory":
+    def of_plan(cls, goal: Array, costs: Array) -> "_Pursuit":
         """Returns that of the controller's own plan to a set point."""
         cost = float(finite_costs(costs).sum())
         return cls(
@@ -103,8 +105,8 @@ class _Memory(NamedTuple):
 
     @classmethod
     def of_flight(
-        cls, goal: Array, flight: Flight, horizon: int, last: "_Memory | None"
-    ) -> "_Memory":
+        cls, goal: Array, flight: ModelFlight, horizon: int, last: "_Pursuit | None"
+    ) -> "_Pursuit":
         """Returns that of a flight that was found.
 
         What a flight to the same goal promised and cost before still counts.
@@ -125,7 +127,7 @@ class _Memory(NamedTuple):
             arrives=flight.arrives,
         )
 
-    def after_decision(self, costs: Array) -> "_Memory":
+    def after_decision(self, costs: Array) -> "_Pursuit":
         """Returns it after one more decision of the controller, with its plan's costs.
 
         Costs are those of the stages (H,).
@@ -137,7 +139,7 @@ class _Memory(NamedTuple):
             flight=None,
         )
 
-    def after_flown_stage(self, flight: Flight, horizon: int) -> "_Memory":
+    def after_flown_stage(self, flight: ModelFlight, horizon: int) -> "_Pursuit":
         """Returns it after one more decision along a flight, from that decision on."""
         return self._replace(
             remaining=self.remaining - float(self.costs[0]),
@@ -146,7 +148,7 @@ class _Memory(NamedTuple):
             flight=flight,
         )
 
-    def after_failed_steps(self, decision: Decision, horizon: int) -> "_Memory":
+    def after_failed_steps(self, decision: Decision, horizon: int) -> "_Pursuit":
         """Returns it with its flight from a decision's step on.
 
         A failed step may have left stages behind, which are paid by now. Of a flight
@@ -174,15 +176,15 @@ class _Memory(NamedTuple):
 class _FollowedDecision(Decision):
     """A decision on the way that a search found."""
 
-    memory: _Memory | None = None
+    pursuit: _Pursuit | None = None
 
     @classmethod
-    def of(cls, decision: Decision, memory: _Memory) -> "_FollowedDecision":
+    def of(cls, decision: Decision, pursuit: _Pursuit) -> "_FollowedDecision":
         """Returns a decision with what it leaves for the next one."""
         values = {
             field.name: getattr(decision, field.name) for field in fields(Decision)
         }
-        return cls(**values, memory=memory)
+        return cls(**values, pursuit=pursuit)
 
 
 class _FlightSearch:
@@ -198,7 +200,7 @@ class _FlightSearch:
         self._foresight = foresight
         self._question = question
         self._deadline = deadline
-        self._flights: list[Flight] = []
+        self._flights: list[ModelFlight] = []
         self._lowest = inf  # cost of a flight that arrives
         self.best_controller = controller  # whose flight that is
 
@@ -207,7 +209,7 @@ class _FlightSearch:
         """Whether the time is over, and some flight is at hand."""
         return bool(self._flights) and perf_counter() > self._deadline
 
-    def add(self, flight: Flight) -> None:
+    def add(self, flight: ModelFlight) -> None:
         """Adds a flight that was made before."""
         self._flights.append(flight)
 
@@ -222,7 +224,7 @@ class _FlightSearch:
             self._lowest = flight.cost
             self.best_controller = beginning.controller
 
-    def best(self) -> Flight | None:
+    def best(self) -> ModelFlight | None:
         """Returns the best flight, after the first few were improved; None without."""
         foresight = self._foresight
         question = self._question
@@ -419,21 +421,23 @@ class ManyStarts:
         is no longer than a horizon, the controller's own plans are.
         """
         question = self._question(situation)
-        memory = self._memory(situation)
+        pursuit = self._pursuit(situation)
         current = None  # what is left of the flight that was followed
-        if memory is not None and memory.flight is not None:
-            current = self._remaining_flight(memory.flight, memory, situation, question)
-            memory = memory.after_flown_stage(current, self.horizon)
-            if self._is_as_promised(current, memory):
-                return self._decide_along(current, memory, situation, question)
+        if pursuit is not None and pursuit.flight is not None:
+            current = self._remaining_flight(
+                pursuit.flight, pursuit, situation, question
+            )
+            pursuit = pursuit.after_flown_stage(current, self.horizon)
+            if self._is_as_promised(current, pursuit):
+                return self._decide_along(current, pursuit, situation, question)
         else:
-            decision = self._continue_plan(situation, question, memory)
+            decision = self._continue_plan(situation, question, pursuit)
             if decision is not None:
                 return decision
-        return self._search_anew(situation, question, memory, current)
+        return self._search_anew(situation, question, pursuit, current)
 
     def _continue_plan(
-        self, situation: _Situation, question: Question, memory: _Memory | None
+        self, situation: _Situation, question: Question, pursuit: _Pursuit | None
     ) -> Decision | None:
         """Returns the controller's decision from its last plan.
 
@@ -444,19 +448,19 @@ class ManyStarts:
             return None
         decision = self._improve(situation, previous)
         costs = self._foresight.meter(decision.means, decision.inputs, question)
-        if not decision.applicable or self._is_lost(costs, memory):
+        if not decision.applicable or self._is_lost(costs, pursuit):
             return None
-        next_memory = _Memory.of_plan(np.array(situation.end), costs)
-        if memory is not None:
-            next_memory = memory.after_decision(costs)
-        return _FollowedDecision.of(decision, next_memory)
+        next_pursuit = _Pursuit.of_plan(np.array(situation.end), costs)
+        if pursuit is not None:
+            next_pursuit = pursuit.after_decision(costs)
+        return _FollowedDecision.of(decision, next_pursuit)
 
     def _search_anew(
         self,
         situation: _Situation,
         question: Question,
-        memory: _Memory | None,
-        current: Flight | None,
+        pursuit: _Pursuit | None,
+        current: ModelFlight | None,
     ) -> Decision:
         """Returns the decision along the cheapest flight of a search.
 
@@ -466,31 +470,31 @@ class ManyStarts:
         flight = self._search_flight(situation, question, current)
         if flight is None:
             return self._search_plan(situation)
-        memory = _Memory.of_flight(
+        pursuit = _Pursuit.of_flight(
             goal=np.array(situation.end),
             flight=flight,
             horizon=self.horizon,
-            last=memory,
+            last=pursuit,
         )
-        return self._decide_along(flight, memory, situation, question)
+        return self._decide_along(flight, pursuit, situation, question)
 
     def _remaining_flight(
         self,
-        flight: Flight,
-        memory: _Memory,
+        flight: ModelFlight,
+        pursuit: _Pursuit,
         situation: _Situation,
         question: Question,
-    ) -> Flight:
+    ) -> ModelFlight:
         """Returns what is left of a flight, from the state that its stage led to.
 
         Where a disturbance made it dearer than it was to be, it is improved.
         """
         foresight = self._foresight
         remaining = foresight.follow(
-            flight.after(1), situation.state, question, memory.dearest
+            flight.after(1), situation.state, question, pursuit.dearest
         )
-        promised = memory.remaining - float(memory.costs[0])
-        limit = promised + _DRIFT * memory.promised
+        promised = pursuit.remaining - float(pursuit.costs[0])
+        limit = promised + _DRIFT * pursuit.promised
         if remaining.arrives and remaining.cost > limit:
             remaining = foresight.improve(
                 remaining, question, rounds=1, programs=_CORRECTIONS
@@ -498,10 +502,10 @@ class ManyStarts:
             remaining = foresight.with_gains(remaining, question)
         return remaining
 
-    def _is_as_promised(self, flight: Flight, memory: _Memory) -> bool:
+    def _is_as_promised(self, flight: ModelFlight, pursuit: _Pursuit) -> bool:
         """Tells whether a flight costs what it was to, and arrives if it was to."""
-        limit = memory.remaining + _RISE * memory.promised
-        return flight.cost <= limit and (flight.arrives or not memory.arrives)
+        limit = pursuit.remaining + _RISE * pursuit.promised
+        return flight.cost <= limit and (flight.arrives or not pursuit.arrives)
 
     def _question(self, situation: _Situation) -> Question:
         """Returns what the controller is asked on the way, beside its last plan."""
@@ -519,29 +523,29 @@ class ManyStarts:
             disturbance=disturbance,
         )
 
-    def _memory(self, situation: _Situation) -> _Memory | None:
+    def _pursuit(self, situation: _Situation) -> _Pursuit | None:
         """Returns what the last decision left; None for another goal."""
         previous = situation.previous
-        if not isinstance(previous, _FollowedDecision) or previous.memory is None:
+        if not isinstance(previous, _FollowedDecision) or previous.pursuit is None:
             return None
-        if not np.array_equal(previous.memory.goal, situation.end):
+        if not np.array_equal(previous.pursuit.goal, situation.end):
             return None
-        return previous.memory.after_failed_steps(previous, self.horizon)
+        return previous.pursuit.after_failed_steps(previous, self.horizon)
 
-    def _is_lost(self, costs: Array, memory: _Memory | None) -> bool:
+    def _is_lost(self, costs: Array, pursuit: _Pursuit | None) -> bool:
         """Tells whether a plan of stages with costs (H,) is to be searched anew."""
-        if memory is None:
+        if pursuit is None:
             return not self._foresight.arrives(costs)
-        if self._foresight.arrives(costs, memory.dearest):
+        if self._foresight.arrives(costs, pursuit.dearest):
             return False
-        rise = costs[:-1].sum() - finite_costs(memory.costs[1:]).sum()
-        is_dearer = rise > _RISE * memory.promised
-        return is_dearer or memory.age >= self._foresight.longest
+        rise = costs[:-1].sum() - finite_costs(pursuit.costs[1:]).sum()
+        is_dearer = rise > _RISE * pursuit.promised
+        return is_dearer or pursuit.age >= self._foresight.longest
 
     def _decide_along(
         self,
-        flight: Flight,
-        memory: _Memory,
+        flight: ModelFlight,
+        pursuit: _Pursuit,
         situation: _Situation,
         question: Question,
     ) -> Decision:
@@ -555,11 +559,11 @@ class ManyStarts:
             question.parameters,
             plan=(inputs, means),
         )
-        return _FollowedDecision.of(_with_plan(decision, inputs, means), memory)
+        return _FollowedDecision.of(_with_plan(decision, inputs, means), pursuit)
 
     def _search_flight(
-        self, situation: _Situation, question: Question, current: Flight | None
-    ) -> Flight | None:
+        self, situation: _Situation, question: Question, current: ModelFlight | None
+    ) -> ModelFlight | None:
         """Returns the cheapest flight of all starts, under its feedback.
 
         ``current`` is what is left of the flight that was followed. None where the
@@ -714,7 +718,7 @@ def _are_alike(inputs: Array, others: Array) -> bool:
     return bool(np.allclose(inputs, others, atol=_ALIKE * np.ptp(others)))
 
 
-def _order(one: Flight, other: Flight) -> int:
+def _order(one: ModelFlight, other: ModelFlight) -> int:
     """Returns a number below zero where a flight is better than another."""
     return int(other.is_better_than(one)) - int(one.is_better_than(other))
 

@@ -19,7 +19,7 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
-from gpmpc.mpc._foresight import Flight, Foresight, Trajectory
+from gpmpc.mpc._foresight import Foresight, ModelFlight, Trajectory
 from gpmpc.mpc._question import Question
 from gpmpc.mpc._stage_meter import StageMeter
 from gpmpc.propagation import Linearization
@@ -147,9 +147,9 @@ def test_a_flight_follows_the_controller_and_ends_at_the_goal():
 def test_a_flight_that_arrives_beats_a_cheaper_one_that_stands():
     states = np.zeros((4, 1))
     inputs = np.zeros((3, 1))
-    arrives = Flight(states, inputs, np.array([9.0, 9.0, 0.0]), True)
-    stands = Flight(states[:3], inputs[:2], np.array([3.0, 3.0]), False)
-    falls = Flight(states, inputs, np.array([3.0, 2.0, 1.0]), False)
+    arrives = ModelFlight(states, inputs, np.array([9.0, 9.0, 0.0]), True)
+    stands = ModelFlight(states[:3], inputs[:2], np.array([3.0, 3.0]), False)
+    falls = ModelFlight(states, inputs, np.array([3.0, 2.0, 1.0]), False)
     assert arrives.is_better_than(stands)
     assert not stands.is_better_than(arrives)
     assert falls.is_better_than(stands)  # which costs 9 over as many stages
@@ -206,7 +206,7 @@ def test_feedback_of_a_flight_weighs_outputs_as_it_weighs_states():
         cost = Tracking(states_weight, [0.01], penalized="inputs", angles=(0,))
         problem = Problem(cost, inputs=Box([-2.0], [2.0]), outputs=outputs)
         foresight = Foresight(controller(pendulum(), problem, 10))
-        flight = Flight(np.zeros((13, 2)), np.zeros((12, 1)), np.zeros(12), True)
+        flight = ModelFlight(np.zeros((13, 2)), np.zeros((12, 1)), np.zeros(12), True)
         asked = question(Reference(np.zeros(2)).over(10))
         gains.append(foresight.with_gains(flight, asked).gains)
     assert np.abs(gains[0]).min() > 0.1

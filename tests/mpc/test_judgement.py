@@ -455,3 +455,12 @@ def test_a_state_that_is_to_stay_is_not_frozen():
         plan = replace(plan_of(measured), means=means)
         judgement = judge.judge(measured, np.zeros(2), plan)
         assert "is measured the same" not in judgement.reason
+
+
+def test_an_input_at_its_bound_from_the_first_unknown_step_is_named():
+    judge = FlightJudge(CONTROLLER.problem)
+    for k in range(50):
+        measured = np.full(2, np.nan) if k == 0 else np.array([1.0, 0.01 * (k % 2)])
+        plan = plan_of(np.array([1.0, 0.0]))
+        judgement = judge.judge(measured, np.zeros(2), replace(plan, input=np.ones(1)))
+    assert judgement.reason.startswith("input 0 is at its bound")
