@@ -275,6 +275,12 @@ COMMANDS = {
                 metavar="N",
                 help="how many points are kept, those that explain most (all)",
             ),
+            _argument(
+                "--name",
+                default="gpmpc",
+                help="of header and source, and what their names begin with, such as "
+                "outer for outer_step: two controllers of one program need two (gpmpc)",
+            ),
             _TRUST,
         ],
     ),

@@ -28,6 +28,7 @@ from gpmpc.cli._recorded import (
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.export import (
     Answer,
+    CompiledController,
     CompiledLoop,
     Question,
     answers,
@@ -35,6 +36,7 @@ from gpmpc.export import (
     write_replay,
 )
 from gpmpc.export._checks import check_exportable
+from gpmpc.export._write import check_name
 from gpmpc.mpc import GPMPC, Reference
 from gpmpc.recording import Run, read_run
 from gpmpc.studies.flight import Experiment
@@ -45,6 +47,7 @@ def export(arguments: argparse.Namespace) -> Result:
     """Writes a controller as C, and replays its flight by it."""
     console = Console()
     budget = budget_of(arguments)
+    check_name(arguments.name)
     path = _only_recording(arguments.run)
     run = read_run(path)
     experiment = experiment_of_run(run, arguments.trust)
@@ -56,12 +59,18 @@ def export(arguments: argparse.Namespace) -> Result:
     precision = arguments.precision
     questions = list(_questions(run, experiment, controller))
     with writing(folder, "to"):
-        export_c(controller, folder, precision, policy, points=kept.points)
+        export = export_c(
+            controller,
+            folder,
+            precision,
+            policy,
+            points=kept.points,
+            name=arguments.name,
+        )
         steps = write_replay(kept.controller, questions, folder / "replay.txt", policy)
         _write_points(folder / "points.md", kept, arguments.budget)
-    lines = [
-        f"written to {folder}: src/gpmpc.h, src/gpmpc.c, and a replay of {steps} steps"
-    ]
+    header, source = (f"src/{file.name}" for file in export)
+    lines = [f"written to {folder}: {header}, {source}, and a replay of {steps} steps"]
     lines += kept.lines
     lines += [
         f"{change}: what is exported is what this code makes of the same settings"
@@ -124,7 +133,9 @@ def _controller_of(run: Run, experiment: Experiment) -> GPMPC:
             with one_thread(), errors_of_settings(run):
                 rows = experiment.training_rows()
                 model = experiment.learn(rows, experiment.seed).posterior
-    controller = experiment.controller(model)
+    controller: Any = experiment.controller(model)
+    if isinstance(controller, CompiledController):  # the run was flown as C
+        controller = controller.source
     check_exportable(controller, experiment.on_failure)
     return controller
 

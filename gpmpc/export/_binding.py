@@ -15,7 +15,7 @@ import torch
 
 from gpmpc._arrays import read_array
 from gpmpc._dynamics import DynamicsModel, to_array
-from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.export._c_types import fields_type, reference_type
 from gpmpc.export._checks import check_kappas
 from gpmpc.export._filter import Estimator
@@ -96,6 +96,7 @@ class CompiledLibrary:
             self._measured = estimator.filter.measurement.output_dim
         self._inputs = controller.prediction.input_dim
         self._horizon = controller.horizon
+        self._penalized = controller.problem.cost.penalized
         with tempfile.TemporaryDirectory() as folder:
             export = write_code(
                 controller, Path(folder), precision, on_failure, estimator
@@ -123,23 +124,28 @@ class CompiledLibrary:
         """Returns a reference, and parameters, as the code takes them.
 
         Raises:
-            ShapeError: One of another size than the controller's.
+            ShapeError: One of another size than the controller's, or without inputs
+                from which deviations are weighed.
+            DataError: One that is not finite.
             SettingError: Kappas, which exported code takes from the problem.
         """
         followed = reference.over(self._horizon)
         check_kappas(followed)
         rows = self._horizon + 1
-        _check_shape("a reference", followed.states, (rows, self._states))
+        _check_numbers("a reference", followed.states, (rows, self._states))
         converted = self._reference_type()
         if self._parameters:
             rows = parameter_rows(parameters, self._horizon, self._parameters)
             view(converted.parameters)[:] = rows
         view(converted.states)[:] = followed.states
+        shape = (self._horizon, self._inputs)
         if followed.inputs is not None:
-            inputs = followed.inputs
-            _check_shape("reference inputs", inputs, (self._horizon, self._inputs))
+            _check_numbers("reference inputs", followed.inputs, shape)
             view(converted.inputs)[:] = followed.inputs
             converted.has_inputs = 1
+        elif self._penalized == "deviations":
+            rule = f"penalized 'deviations' needs reference inputs {shape}"
+            raise ShapeError(f"{rule}; got none")
         return converted
 
     def step(
@@ -184,6 +190,13 @@ def _check_shape(name: str, numbers: Any, shape: tuple[int, ...]) -> None:
         raise ShapeError(f"{name} must have the shape {shape}; got {got}")
 
 
+def _check_numbers(name: str, numbers: Any, shape: tuple[int, ...]) -> None:
+    """Raises an error unless there are as many numbers, all finite."""
+    _check_shape(name, numbers, shape)
+    if not np.isfinite(np.asarray(numbers, dtype=float)).all():
+        raise DataError(f"{name} must be finite")
+
+
 def _address(array: Array) -> ctypes.c_void_p:
     return array.ctypes.data_as(ctypes.c_void_p)
 
@@ -196,6 +209,9 @@ class CompiledController:
         precision: Of all numbers, ``"double"`` or ``"float"``.
         compiler: A C compiler, with options.
 
+    Attributes:
+        source: The controller that was compiled.
+
     Raises:
         SettingError: The controller cannot be exported, or there is no compiler.
     """
@@ -206,7 +222,7 @@ class CompiledController:
         precision: Precision = "double",
         compiler: Sequence[str] = COMPILER,
     ):
-        self._controller = controller
+        self.source = controller
         self._library = CompiledLibrary(controller, precision, compiler=compiler)
         self._struct = self._library.new_controller()
         self.horizon = controller.horizon
@@ -216,7 +232,7 @@ class CompiledController:
     @property
     def signals(self) -> Signals:
         """Names of states and inputs, and time step, as far as the model knows them."""
-        return self._controller.signals
+        return self.source.signals
 
     def control(
         self,

@@ -130,13 +130,11 @@ def filter_definitions(estimator: Estimator | None, state_dim: int) -> dict[str,
     """Returns what is measured at a step, as settings of the code."""
     if estimator is None:
         return {
-            "GPMPC_FILTERS": "0",
             "GPMPC_MEASURED": str(state_dim),
             "GPMPC_MEASURED_ANGLE_COUNT": "0",
         }
     measurement = estimator.filter.measurement
     return {
-        "GPMPC_FILTERS": "1",
         "GPMPC_MEASURED": str(measurement.output_dim),
         "GPMPC_MEASURED_ANGLE_COUNT": str(len(measurement.angles)),
     }

@@ -34,6 +34,24 @@ _COMMENTS = {
     "GPMPC_PENALIZED": "what R weighs: 0 inputs, 1 deviations, 2 increments",
     "GPMPC_TOLERANCE": "of a solution, as a share of its size",
     "GPMPC_DISTURBANCE_GAIN": "of the estimate of a constant error",
+    "GPMPC_STATE_WEIGHTS": "weights Q: one, or one for each stage",
+    "GPMPC_INPUT_WEIGHTS": "weights R, likewise",
+    "GPMPC_COST_ANGLE_COUNT": "states whose error counts modulo 2 pi",
+    "GPMPC_STATE_ANGLE_COUNT": "states that are angles to the cost or the model",
+    "GPMPC_MEASURED_ANGLE_COUNT": "measured entries that count modulo 2 pi",
+    "GPMPC_IS_FLOAT": "whether numbers are float",
+    "GPMPC_HAS_RATES": "whether increments of inputs are bounded",
+    "GPMPC_SOFT": "whether rows may be violated at a price",
+    "GPMPC_ELASTIC": "whether rows give way where no plan keeps them",
+    "GPMPC_SMOOTH": "whether rows are functions that are linearised",
+    "GPMPC_OUTPUTS": "whether functions of state and input are weighed",
+    "GPMPC_TUBES": "whether covariances tighten rows",
+    "GPMPC_FEEDBACK": "whether covariances and roll-outs know a feedback",
+    "GPMPC_ROLLS_OUT": "whether plans are rolled out by the model",
+    "GPMPC_HELD": "whether one linearisation is held over the horizon",
+    "GPMPC_KNOWS_RANGES": "whether the ranges of the data are known",
+    "GPMPC_ESTIMATES": "whether a constant error of the model is estimated",
+    "GPMPC_HOLDS": "whether a failed step keeps the last input",
 }
 
 
@@ -42,10 +60,13 @@ class Definitions(NamedTuple):
 
     values: dict[str, str]
     comments: dict[str, str]
+    flags: dict[str, int]  #: that decide which parts of the code there are
 
     def text(self) -> str:
         """Returns them as lines of a header."""
-        lines = []
+        lines = [
+            "/* What this controller is: other numbers do not make another one. */"
+        ]
         for name, value in self.values.items():
             note = self.comments.get(name)
             lines.append(
@@ -115,8 +136,11 @@ def definitions(
     values |= {f"GPMPC_{name}": str(size) for name, size in model_sizes.items()}
     values |= filter_definitions(estimator, prediction.state_dim)
     flags = _flags(controller, numbers, on_failure)
+    flags["GPMPC_FILTERS"] = estimator is not None
     values |= {name: str(int(flag)) for name, flag in flags.items()}
-    return Definitions(values, _COMMENTS)
+    conditions = {name: int(flag) for name, flag in flags.items()}
+    conditions["GPMPC_KERNELS"] = model_sizes["KERNELS"]
+    return Definitions(values, _COMMENTS, conditions)
 
 
 def _flags(controller: GPMPC, numbers: Numbers, on_failure: str) -> dict[str, bool]:

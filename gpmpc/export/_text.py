@@ -1,6 +1,6 @@
 """Numbers, arrays and comments as C text."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -87,5 +87,47 @@ def split_jacobian(rows: int, n: int, m: int) -> list[str]:
 
 
 def comment(text: str) -> str:
-    """Returns text that no comment of C ends early."""
-    return text.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/")
+    """Returns text as one line of a comment in C, which it does not end early."""
+    shown = "".join(letter if letter.isprintable() else " " for letter in text)
+    shown = shown.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/")
+    return shown.replace("??", "? ?")  # a trigraph
+
+
+def needed_parts(text: str, flags: Mapping[str, int]) -> str:
+    """Returns code of C without what flags exclude: ``#if`` of these is decided here.
+
+    Args:
+        text: With conditions such as ``#if A || !B``; others stay as they are.
+        flags: Values by name.
+    """
+    lines = []
+    # by open condition: whether it is decided here, and whether its lines are needed
+    conditions: list[tuple[bool, bool]] = []
+    for line in text.splitlines():
+        words = line.split()
+        directive = words[0] if words else ""
+        decided, needed = conditions[-1] if conditions else (False, True)
+        if directive in ("#if", "#ifdef", "#ifndef"):
+            alternatives = " ".join(words[1:]).split(" || ")
+            is_decided = directive == "#if" and all(
+                name.lstrip("!") in flags for name in alternatives
+            )
+            holds = is_decided and any(_holds(name, flags) for name in alternatives)
+            conditions.append((is_decided, holds))
+            is_directive = is_decided
+        elif directive == "#else":
+            conditions[-1] = (decided, not needed if decided else needed)
+            is_directive = decided
+        elif directive == "#endif":
+            conditions.pop()
+            is_directive = decided
+        else:
+            is_directive = False
+        if not is_directive and all(part or not own for own, part in conditions):
+            lines.append(line)
+    return "\n".join(lines) + "\n"
+
+
+def _holds(name: str, flags: Mapping[str, int]) -> bool:
+    """Returns whether a flag is set, or with ``!`` before it is not."""
+    return bool(flags[name.lstrip("!")]) is not name.startswith("!")

@@ -1,5 +1,7 @@
 """Writes a controller as one header and one source in C99."""
 
+import re
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -8,18 +10,37 @@ from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel
 from gpmpc._files import write_whole
 from gpmpc.estimation import KalmanFilter
-from gpmpc.exceptions import check_choice
+from gpmpc.exceptions import SettingError, check_choice
 from gpmpc.export._checks import check_exportable
 from gpmpc.export._filter import Estimator, FilterWriter, check_estimator
 from gpmpc.export._functions import FunctionWriter
 from gpmpc.export._models import ModelWriter
 from gpmpc.export._points import posterior_of, with_points
-from gpmpc.export._problems import definitions, needs_means_alone, tables, tightens
-from gpmpc.export._text import Numbers, Precision, comment
+from gpmpc.export._problems import (
+    Definitions,
+    definitions,
+    needs_means_alone,
+    tables,
+    tightens,
+)
+from gpmpc.export._text import Numbers, Precision, comment, needed_parts
 from gpmpc.mpc import GPMPC
 
 _HERE = Path(__file__).parent
-
+_NAME = "gpmpc"
+# in every file that is written, and in no other
+_MARK = "Written by gpmpc"
+_PREFIX = re.compile(r"(?<![A-Za-z])gpmpc(?=_|\.[ch]\b)")
+# a header of such a name, or a target of such a name, would hide another one
+_TAKEN = frozenset(
+    {
+        *("assert", "complex", "ctype", "errno", "fenv", "float", "inttypes"),
+        *("iso646", "limits", "locale", "math", "setjmp", "signal", "stdarg"),
+        *("stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath"),
+        *("time", "wchar", "wctype"),
+        *("all", "check", "clean", "help", "install", "m", "replay", "test"),
+    }
+)
 
 # what stands around the code, by its place in the folder
 _AROUND = {
@@ -48,6 +69,7 @@ def export_c(
     on_failure: str = "previous_plan",
     estimator: Estimator | None = None,
     points: int | None = None,
+    name: str = _NAME,
 ) -> Export:
     """Writes a controller as C into a folder.
 
@@ -67,11 +89,18 @@ def export_c(
             given what sensors show. Without one it is given the state.
         points: How many points its GPs keep, those that explain most; the header says
             so. None keeps all. See ``with_points`` and ``choose_points``.
+        name: Of header and source, and what their public names begin with: two
+            controllers of one program need two, such as ``"outer"`` for
+            ``outer_step``.
 
     Raises:
         SettingError: Controller or filter have a part that C cannot hold; it is named.
+            Or the folder holds a file of somebody else where one is to be written.
     """
+    check_name(name)
     folder = Path(path)
+    around = {folder / place: template for place, template in _AROUND.items()}
+    _check_unwritten([*_sources(folder / "src", name), *around])
     notes: list[str] = []
     if points is not None:
         check_exportable(controller, on_failure)
@@ -79,12 +108,40 @@ def export_c(
         controller, estimator = reduce_points(controller, estimator, points)
         notes.append(_note_of_points(controller.prediction.model, model))
     export = write_code(
-        controller, folder / "src", precision, on_failure, estimator, notes
+        controller, folder / "src", precision, on_failure, estimator, notes, name
     )
-    for place, name in _AROUND.items():
-        (folder / place).parent.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / place, (_HERE / "around" / name).read_text())
+    for file, template in around.items():
+        text = (_HERE / "around" / template).read_text()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(file, _renamed(text, name).replace("@name@", name))
     return export
+
+
+def check_name(name: str) -> None:
+    """Raises ``SettingError`` unless files and names of C may begin with a name."""
+    if re.fullmatch(r"[a-z][a-z0-9_]*", str(name)) is None:
+        rule = "must be small letters, digits and _, a letter first"
+        raise SettingError("name", f"{rule}; got {name!r}")
+    if name in _TAKEN:
+        raise SettingError("name", f"{name} is the name of another file or target")
+
+
+def _check_unwritten(files: Sequence[Path]) -> None:
+    """Raises ``SettingError`` where a file exists that an export did not write."""
+    for file in files:
+        if file.is_file() and _MARK not in file.read_text(errors="replace"):
+            rule = f"{file} was not written by an export; name another folder"
+            raise SettingError("path", rule)
+
+
+def _sources(folder: Path, name: str) -> tuple[Path, Path]:
+    """Returns where header and source are."""
+    return folder / f"{name}.h", folder / f"{name}.c"
+
+
+def _renamed(text: str, name: str) -> str:
+    """Returns code whose public names, and those of its files, begin with a name."""
+    return _PREFIX.sub(name, text).replace("GPMPC_", f"{name.upper()}_")
 
 
 def reduce_points(
@@ -123,19 +180,19 @@ def write_code(
     on_failure: str,
     estimator: Estimator | None = None,
     notes: Sequence[str] = (),
+    name: str = _NAME,
 ) -> Export:
     """Writes header and source alone, notes in their heads; see ``export_c``."""
     check_choice("precision", precision, ("double", "float"))
     check_exportable(controller, on_failure)
     if estimator is not None:
         check_estimator(controller, estimator)
-    header, source = _texts(
-        controller, Numbers(precision), on_failure, estimator, notes
-    )
+    texts = _texts(controller, Numbers(precision), on_failure, estimator, notes)
     folder.mkdir(parents=True, exist_ok=True)
-    write_whole(folder / "gpmpc.h", header)
-    write_whole(folder / "gpmpc.c", source)
-    return Export(header=folder / "gpmpc.h", source=folder / "gpmpc.c")
+    files = Export(*_sources(folder, name))
+    for file, text in zip(files, texts, strict=True):
+        write_whole(file, _renamed(text, name))
+    return files
 
 
 def _texts(
@@ -174,8 +231,11 @@ def _texts(
         "filter": _part("filter.c") if estimator is not None else "",
     }
     names = [*_names(controller, estimator), *notes]
-    header = _header(settings.text(), numbers, names)
-    return header, _source(parts, names)
+    header = _header(settings, numbers, names)
+    source = needed_parts(_source(parts, names), settings.flags)
+    # of both: header and source of two exports do not go together
+    export = f"0x{zlib.crc32((header + source).encode()):08x}ul"
+    return header.replace("{export}", export), source.replace("{export}", export)
 
 
 def _gp_code(model: ModelWriter, numbers: Numbers) -> str:
@@ -186,7 +246,7 @@ def _gp_code(model: ModelWriter, numbers: Numbers) -> str:
     return _part("gp.c").replace("/*{fixed}*/", fixed)
 
 
-def _header(settings: str, numbers: Numbers, names: list[str]) -> str:
+def _header(settings: Definitions, numbers: Numbers, names: list[str]) -> str:
     """Returns the header."""
     lines = [
         _banner("A controller in C: its memory and its calls.", names),
@@ -195,11 +255,13 @@ def _header(settings: str, numbers: Numbers, names: list[str]) -> str:
         "",
         "#include <stdint.h>",
         "",
+        "#define GPMPC_EXPORT {export} /* that header and source are of */",
+        "",
         f"typedef {numbers.precision} gpmpc_real;",
         "",
-        settings,
+        settings.text(),
         "",
-        _part("core.h"),
+        needed_parts(_part("core.h"), settings.flags),
         "#endif",
         "",
     ]
@@ -220,6 +282,10 @@ def _source(parts: Mapping[str, str], names: list[str]) -> str:
         "#include <stdint.h>",
         "#include <stdlib.h>",
         "#include <string.h>",
+        "",
+        "#if GPMPC_EXPORT != {export}",
+        '#error "gpmpc.h and gpmpc.c are of two exports: take both of one"',
+        "#endif",
         "",
         _part("numbers.h"),
         core,
@@ -255,6 +321,6 @@ def _names(controller: GPMPC, estimator: Estimator | None) -> list[str]:
 
 def _banner(title: str, names: list[str]) -> str:
     """Returns the comment that a file begins with."""
-    lines = [title, "Written by gpmpc; the next export overwrites it.", "", *names]
+    lines = [title, f"{_MARK}; the next export overwrites it.", "", *names]
     body = "\n   ".join(comment(line) for line in lines)
-    return f"/* {body} */\n"
+    return f"/* {body} */\n".replace("\n   \n", "\n\n")

@@ -656,7 +656,7 @@ static int write_rows(gpmpc_problem *problem, const gpmpc_reference *reference)
     return finite;
 }
 
-#if GPMPC_ROLLS_OUT
+#if GPMPC_ROLLS_OUT || !GPMPC_IS_FLOAT
 /* By how much the plan misses a bound of states, inputs or increments, at most. */
 static real largest_violation(const gpmpc_problem *problem)
 {
@@ -1529,12 +1529,13 @@ static int decide(gpmpc_controller *controller, const real *state,
 #endif
 #endif
     *applicable = status == GPMPC_SOLVED || keeps_hard_rows(problem);
-#if GPMPC_ROLLS_OUT
+#if GPMPC_ROLLS_OUT || !GPMPC_IS_FLOAT
     controller->violation = largest_violation(problem);
 #else
-    controller->violation = solution->violation;
+    controller->violation = solution->violation; /* in doubled digits */
 #endif
-    if (status == GPMPC_SOLVED && controller->violation > KEPT)
+    if ((GPMPC_SOFT || GPMPC_SMOOTH) && status == GPMPC_SOLVED
+        && controller->violation > KEPT)
         return GPMPC_SOFT_BOUND_MISSED;
     return status;
 }

@@ -2,6 +2,14 @@
 #if defined(DBL_MANT_DIG) && DBL_MANT_DIG != 53
 #error "sums of the GPs need a double of 64 bits"
 #endif
+/* Digits that are doubled, and tests for numbers that are not finite, do not survive
+   sums in another order: inputs were off by the whole range. */
+#if defined(__FAST_MATH__) || defined(__ASSOCIATIVE_MATH__) || defined(_M_FP_FAST)
+#error "compile without -ffast-math and the like: sums must stay in their order"
+#endif
+#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__
+#error "compile without -ffinite-math-only: what is not finite must be seen"
+#endif
 
 /* Numbers that depend on the digits. Each is a power of the rounding unit: in float the
    same power of a larger one. */

@@ -834,7 +834,8 @@ static real refine(const gpmpc_problem *problem, gpmpc_program *work, int k,
     return residual;
 }
 
-/* The largest violation beyond what multipliers pay for, as a share of the bound. */
+/* The largest violation beyond what multipliers pay for, as a share of the bound. A
+   constraint at its cap violates that by being inside the bound which it pays for. */
 static real worst_violation(const gpmpc_program *work)
 {
     real least = work->negligible_length;
@@ -847,8 +848,10 @@ static real worst_violation(const gpmpc_program *work)
         real below = work->lower[p] - work->value[p];
         real bound = above > below ? work->upper[p] : work->lower[p];
         real size = larger(length * work->norm[p] / 1000, absolute(bound));
-        if (absolute(work->multiplier[p]) < work->cap[p])
-            worst = larger(worst, (larger(above, below) - work->negligible[p]) / size);
+        real violation = larger(above, below);
+        if (!(absolute(work->multiplier[p]) < work->cap[p]))
+            violation = work->multiplier[p] > 0 ? -above : -below;
+        worst = larger(worst, (violation - work->negligible[p]) / size);
     }
     return worst;
 }

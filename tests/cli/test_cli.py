@@ -123,6 +123,10 @@ def test_help_lists_the_commands_and_a_commands_settings(tmp_path):
             ["export", "c", "run", "--points", "9", "--budget", "ram=9kB"],
             "--points: is chosen by --budget; leave one of them out",
         ),
+        (
+            ["export", "c", "run", "--name", "math"],
+            "name: math is the name of another file or target",
+        ),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

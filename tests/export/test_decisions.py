@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.exceptions import ShapeError
+from gpmpc.exceptions import DataError, ShapeError
 from gpmpc.export import CompiledController, CompiledLoop
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
@@ -38,7 +38,7 @@ from gpmpc.status import Status
 from tests.mpc.small_models import pendulum_posterior
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
-COMPILER = ("cc", "-O1", "-Wall", "-Wextra", "-Werror", "-pedantic")
+COMPILER = ("cc", "-O0", "-Wall", "-Wextra", "-Werror", "-pedantic")
 GP = pendulum_posterior()
 WEIGHTS = Tracking([1.0, 0.1], [0.05])
 TORQUES = Box([-2.0], [2.0])
@@ -117,13 +117,13 @@ def by_stage():
     return gpmpc(Problem(cost, inputs, constraints=[rows]), rolled_out=True)
 
 
-def tube(penalty):
+def tube(penalty, **prediction):
     """A plane that is kept with 90 %, under rates and process noise."""
     plane = Halfspaces([[1.0, 0.2]], [0.3], probability=0.9, penalty=penalty)
     problem = Problem(
         WEIGHTS, TORQUES, input_rates=Box([-0.8], [0.8]), constraints=[plane]
     )
-    return gpmpc(problem)
+    return gpmpc(problem, **prediction)
 
 
 def obstacle():
@@ -207,24 +207,60 @@ def test_every_status_is_met():
 
 
 def test_holds_the_input_where_that_is_asked():
-    controller = tube(None)
+    """Plans that are rolled out miss the hard plane, and count as solved."""
+    controller = tube(None, rolled_out=True)
     python = ControlLoop(controller, "hold")
     compiled = CompiledLoop(controller, on_failure="hold", compiler=COMPILER)
+    missed = 0
     for measured, reference in questions(controller, 40):
         expected = python.input(measured, reference)
         assert np.abs(compiled.input(measured, reference) - expected).max() < 1e-9
+        assert python.last is not None
+        assert compiled.status is python.last.status
+        decision = python.last.decision
+        missed += decision is not None and decision.violation > 1e-5
+    assert missed
 
 
 def test_float_differs_by_little():
     """By 1e-4 of the torques' range, and with the same statuses."""
     controller = tube("elastic")
     python = ControlLoop(controller)
-    compiled = CompiledLoop(controller, precision="float", compiler=COMPILER)
+    optimised = (*COMPILER, "-O1")  # which warns of more
+    compiled = CompiledLoop(controller, precision="float", compiler=optimised)
     for measured, reference in questions(controller, 40):
         expected = python.input(measured, reference)
         assert np.abs(compiled.input(measured, reference) - expected).max() < 4e-4
         assert python.last is not None
         assert compiled.status is python.last.status
+
+
+def test_float_pays_no_price_for_a_bound_that_is_kept():
+    """Of two exact bounds no input moves one: its price outweighs all else."""
+    plant = Affine(
+        torch.tensor([[1.0, 0, 0, 0.1], [0, 1, 0, -0.1], [0, 0, 1, 0], [0, 0, 0, 1]]),
+        torch.tensor([[-0.107, -0.074], [0.216, 0.211], [-0.148, -0.110], [0, 0]]),
+        torch.zeros(4),
+    )
+    problem = Problem(
+        Tracking([9.0, 2.2, 11.0, 5.0], [0.009, 0.01], penalized="inputs"),
+        Box([-1.1, -2.2], [2.0, 1.7]),
+        constraints=[
+            Box(
+                [-np.inf, -np.inf, -0.93, -1.2],
+                [np.inf, 0.44, np.inf, 0.3],
+                penalty="exact",
+            )
+        ],
+    )
+    controller = gpmpc(problem, KnownModel(plant, 4, 2), horizon=1, covariance="none")
+    python = ControlLoop(controller)
+    compiled = CompiledLoop(controller, precision="float", compiler=COMPILER)
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        measured = rng.normal(0, 0.5, 4)
+        expected = python.input(measured, np.zeros(4))
+        assert np.abs(compiled.input(measured, np.zeros(4)) - expected).max() < 1e-4
 
 
 def test_answers_what_needs_doubled_digits():
@@ -289,6 +325,19 @@ def test_states_of_another_size_are_refused():
     ):
         with pytest.raises(ShapeError, match="must have the shape"):
             compiled.input(measured, origin)
+
+
+def test_references_are_refused_as_python_refuses_them():
+    controller = gpmpc(
+        Problem(Tracking([1.0, 0.1], [0.05], penalized="deviations"), TORQUES)
+    )
+    compiled = CompiledLoop(controller, compiler=COMPILER)
+    lost = np.array([np.nan, 0.0])
+    for loop in (ControlLoop(controller), compiled):
+        with pytest.raises(ShapeError, match="needs reference inputs"):
+            loop.input(np.zeros(2), np.zeros(2))
+        with pytest.raises(DataError, match="must be finite"):
+            loop.input(np.zeros(2), Reference(lost, np.zeros(1)))
 
 
 def test_every_operation_of_casadi_is_written():

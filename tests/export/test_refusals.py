@@ -69,6 +69,24 @@ def test_refuses_other_words(key, value, tmp_path):
         export_c(gpmpc(), tmp_path / "folder", **{key: value})
 
 
+@pytest.mark.parametrize("name", ["", "Outer", "2nd", "a b", "math", "replay"])
+def test_refuses_names_that_c_or_make_cannot_hold(name, tmp_path):
+    with pytest.raises(SettingError) as caught:
+        export_c(gpmpc(), tmp_path / "folder", name=name)
+    assert caught.value.key == "name"
+    assert not (tmp_path / "folder").exists()
+
+
+def test_a_file_of_somebody_else_stays(tmp_path):
+    (tmp_path / "Makefile").write_text("all:\n")
+    with pytest.raises(SettingError, match="Makefile was not written by an export"):
+        export_c(gpmpc(), tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["Makefile"]
+    assert (tmp_path / "Makefile").read_text() == "all:\n"
+    for _ in range(2):  # the second goes over the first
+        export_c(gpmpc(), tmp_path / "own")
+
+
 def test_numbers_are_read_back_to_the_same_bits(tmp_path):
     export = export_c(gpmpc(), tmp_path)
     source = export.source.read_text()

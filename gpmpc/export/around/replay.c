@@ -6,7 +6,9 @@
    Every line of the file is a step: what was measured (p), the reference r_0 .. r_H
    ((H + 1) n), whether it has inputs (0 or 1), its inputs (H m), the parameters (H q),
    the input that Python decided on (m), and the status.
-   Prints the largest deviation, and how many statuses differ. */
+   Prints the largest deviation, and how many statuses differ.
+
+   Written by gpmpc; the next export overwrites it. */
 
 #include <math.h>
 #include <stdio.h>

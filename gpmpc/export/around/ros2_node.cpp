@@ -2,6 +2,7 @@
 // ROS 2 is. It takes std_msgs/msg/Float64MultiArray on "measured" (p numbers: the
 // state, or with a filter what sensors show) and on "reference" (n numbers, a set
 // point), and publishes the same type on "input" (m).
+// Written by gpmpc; the next export overwrites it.
 
 #include <rclcpp/rclcpp.hpp>
 #include <std_msgs/msg/float64_multi_array.hpp>
@@ -12,7 +13,7 @@ using Numbers = std_msgs::msg::Float64MultiArray;
 
 class ControllerNode : public rclcpp::Node {
 public:
-    ControllerNode() : Node("gpmpc")
+    ControllerNode() : Node("@name@")
     {
         gpmpc_reset(&controller_);
         publisher_ = create_publisher<Numbers>("input", 1);
