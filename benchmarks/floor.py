@@ -105,8 +105,8 @@ def measured(packed: kernels.Packed, size: int, belief: str) -> dict:
         if belief == "wide"
         else instructions(packed, reduced=False) / max(rates)
     )
-    factor = summed(packed.precision.inverse_cholesky)
-    centred = summed(packed.precision.centred)
+    factor = summed(packed.quadratic_forms.inverse_cholesky)
+    centred = summed(packed.quadratic_forms.doubled_E)
     return {
         "N": size,
         "belief": belief,

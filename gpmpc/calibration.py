@@ -64,7 +64,7 @@ CHUNK = 64
 
 
 @explains_arguments
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Recording:
     """One uninterrupted run at equal time steps.
 
@@ -126,7 +126,7 @@ class Recording:
         return recordings
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Calibration:
     """A comparison of predictions of 1 to H steps, for n states and L levels."""
 

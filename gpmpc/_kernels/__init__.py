@@ -156,7 +156,7 @@ def expand_gps(packed: Packed, x: Array, u: Array) -> Expansion:
     )
     expand_points.unchecked(
         gp=packed.arrays,
-        inverse_cholesky=packed.precision.inverse_cholesky,
+        inverse_cholesky=packed.quadratic_forms.inverse_cholesky,
         x=x,
         u=u,
         out=expansion,
@@ -208,7 +208,7 @@ def moments(
     )
     evaluate_moments.unchecked(
         gp=packed.arrays,
-        precision=packed.precision,
+        forms=packed.quadratic_forms,
         mu=mu,
         S=S,
         u=u,

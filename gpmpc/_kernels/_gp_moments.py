@@ -81,12 +81,16 @@ class _OutputTerms(NamedTuple):
 
 
 class _Scratch(NamedTuple):
-    """Memory to work in; nobody relies on its content after a call but on G_ab."""
+    """Memory to work in.
+
+    Only G_ab outlives a call: derivatives of a pair read that of its moments.
+    """
 
     row: ndarray  # (P,)
     other_row: ndarray  # (P,)
     G_ab: ndarray  # of the pair of outputs (n, n)
-    F: ndarray  # (n, n), like those that follow
+    T_ab: ndarray  # G_ab S (n, n), like those that follow
+    F: ndarray  # of (10)
     X: ndarray
     Y: ndarray
     cross: ndarray
@@ -102,7 +106,7 @@ class _Gradient(NamedTuple):
 
 
 @compiled
-def evaluate_moments(gp, precision, mu, S, u, diagonal, derivatives, out):
+def evaluate_moments(gp, forms, mu, S, u, diagonal, derivatives, out):
     """Writes ``gpmpc._kernels.Moments`` at mu (H, n), S (H, n, n) and u (H, m).
 
     The arrays of ``out`` are full of zeros; those of derivatives are empty where these
@@ -127,13 +131,19 @@ def evaluate_moments(gp, precision, mu, S, u, diagonal, derivatives, out):
             if derivatives:
                 _differentiate_mean(belief, a, h, terms, scratch, out)
         for a in range(k):
-            out.V[h, a, a] = _evaluate_variance(gp, precision, a, terms)
+            out.V[h, a, a] = _evaluate_variance(gp, forms, a, terms)
             if derivatives:
                 _differentiate_variance(belief, a, h, terms, scratch, out)
             for b in range(a, a + 1 if diagonal else k):
-                E = precision.centred[a]
                 P_sum = _evaluate_pair(
-                    belief, a, b, terms, E, derivatives, pair, scratch
+                    belief,
+                    a,
+                    b,
+                    terms,
+                    E=forms.doubled_E[a],
+                    derivatives=derivatives,
+                    pair=pair,
+                    scratch=scratch,
                 )
                 out.V[h, a, b] += P_sum
                 out.V[h, b, a] = out.V[h, a, b]
@@ -189,6 +199,7 @@ def _allocate_scratch(n, padded):
         row=aligned_rows(1, padded)[0],
         other_row=aligned_rows(1, padded)[0],
         G_ab=np.empty((n, n)),
+        T_ab=np.empty((n, n)),
         F=np.empty((n, n)),
         X=np.empty((n, n)),
         Y=np.empty((n, n)),
@@ -249,7 +260,8 @@ def _evaluate_output(belief, a, terms, scratch):
 def _differentiate_mean(belief, a, h, terms, scratch, out):
     """Writes the derivatives of M_a and J_a at point h: (8) with the weights beta q.
 
-    ``first`` of the terms and J_a, which are there, are written once more, the same.
+    The derivative of M_a by the mean is J_a: the sum writes it once more, and ``first``
+    of the terms as well.
     """
     _differentiate_sum(
         v=terms.weighted[a],
@@ -266,10 +278,10 @@ def _differentiate_mean(belief, a, h, terms, scratch, out):
 
 
 @njit_noalloc
-def _evaluate_variance(gp, precision, a, terms):
+def _evaluate_variance(gp, forms, a, terms):
     """Returns sf2_a - |L_a^-1 q_a|^2 of (4); fills ``precision_q`` of the terms."""
     reduction = reduce_variance(
-        precision.inverse_cholesky[a], terms.q[a], terms.precision_q[a]
+        forms.inverse_cholesky[a], terms.q[a], terms.precision_q[a]
     )
     return np.exp(gp.log_signal[a]) - reduction
 
@@ -368,7 +380,7 @@ def _evaluate_pair(belief, a, b, terms, E, derivatives, pair, scratch):
     """
     gp = belief.gp
     n = len(belief.S)
-    T_ab = scratch.F
+    T_ab = scratch.T_ab
     D_a = gp.inverse_squares[a, :n]
     D_b = gp.inverse_squares[b, :n]
     r = terms.half_logdet[a] + terms.half_logdet[b]

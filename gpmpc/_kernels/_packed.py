@@ -33,8 +33,11 @@ class GPArrays(NamedTuple):
     size: int  #: N
 
 
-class Precision(NamedTuple):
-    """(K + sn2 I)^-1 of k GPs in two forms, lower triangles of all entries (k, E)."""
+class QuadraticForms(NamedTuple):
+    """What variances are made of: lower triangles of k matrices in all entries (k, E).
+
+    With (K + sn2 I)^-1 = L^-T L^-1.
+    """
 
     #: L_a^-1, four rows after four rows: of rows i to i + 3 the columns before i + 4,
     #: rounded up to a multiple of 8, with zeros above the diagonal
@@ -42,7 +45,7 @@ class Precision(NamedTuple):
     #: E_a = beta_a beta_a' - (K_a + sn2_a I)^-1, doubled below the diagonal, so that
     #: sums over i >= j suffice; block of 4 x 16 after block, rows of blocks one after
     #: the other
-    centred: Array
+    doubled_E: Array
 
 
 @dataclass(frozen=True)
@@ -68,24 +71,24 @@ class Packed:
         return np.ascontiguousarray(self.cholesky.transpose(0, 2, 1))
 
     @cached_property
-    def precision(self) -> Precision:
-        """The inverses that exact moments and derivatives of the variance read."""
+    def quadratic_forms(self) -> QuadraticForms:
+        """The matrices that exact moments and derivatives of the variance read."""
         size = self.arrays.size
         padded = self.arrays.weights.shape[1]
         inverse = []
-        centred = []
+        doubled_E = []
         for a in range(self.output_dim):
             factor = self.cholesky[a]
             beta = self.arrays.weights[a, :size]
             inverse.append(_inverse_by_four_rows(factor, padded))
-            centred.append(_centred_by_blocks(factor, beta, padded))
-        return Precision(
-            inverse_cholesky=_aligned_copy(inverse), centred=_aligned_copy(centred)
+            doubled_E.append(_doubled_E_by_blocks(factor, beta, padded))
+        return QuadraticForms(
+            inverse_cholesky=_aligned_copy(inverse), doubled_E=_aligned_copy(doubled_E)
         )
 
 
 def _inverse_by_four_rows(factor: Array, padded: int) -> Array:
-    """Returns the inverse of a factor as ``Precision.inverse_cholesky`` (E,)."""
+    """Returns the inverse of a factor as ``QuadraticForms.inverse_cholesky`` (E,)."""
     size = len(factor)
     square = np.zeros((padded, padded))
     square[:size, :size], _ = scipy.linalg.lapack.dtrtri(factor, lower=1)
@@ -95,8 +98,8 @@ def _inverse_by_four_rows(factor: Array, padded: int) -> Array:
     return np.concatenate(rows)
 
 
-def _centred_by_blocks(factor: Array, beta: Array, padded: int) -> Array:
-    """Returns beta beta' - (L L')^-1 as ``Precision.centred`` (E,)."""
+def _doubled_E_by_blocks(factor: Array, beta: Array, padded: int) -> Array:
+    """Returns beta beta' - (L L')^-1 as ``QuadraticForms.doubled_E`` (E,)."""
     size = len(factor)
     precision, _ = scipy.linalg.lapack.dpotri(factor, lower=1)  # the lower triangle
     square = np.zeros((padded, padded))

@@ -114,8 +114,8 @@ def largest_size(row):
 def reduce_variance(triangle, q, solution):
     """Returns |L^-1 q|^2 and writes (K + sn2 I)^-1 q to ``solution``.
 
-    It takes one pass over ``triangle``, L^-1 as ``Precision.inverse_cholesky``: four
-    entries of v = L^-1 q at a time, times their rows, add up to L^-T v.
+    It takes one pass over ``triangle``, L^-1 as ``QuadraticForms.inverse_cholesky``:
+    four entries of v = L^-1 q at a time, times their rows, add up to L^-T v.
     """
     use_widest_registers()
     solution[:] = 0.0

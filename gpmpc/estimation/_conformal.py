@@ -58,7 +58,7 @@ from gpmpc.signals import signals_of
 
 
 @explains_arguments
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ConformalTube:
     """Scores of held-out predictions, and the standard deviations that follow.
 

@@ -23,7 +23,7 @@ from gpmpc.exceptions import DataError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Consistency:
     """Normalised squared errors, and the band that their mean should lie in.
 

@@ -40,7 +40,7 @@ _DEPENDENT = 1e-8
 _RIDGE = 1e-9  # of columns of unit square: some draws of rows do not tell them apart
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DelayEstimate:
     """An estimated delay.
 

@@ -61,7 +61,7 @@ from gpmpc.signals import signals_of
 
 
 @explains_arguments
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Measurement(TensorModel):
     """A measurement model that is a function of the state.
 
@@ -192,7 +192,7 @@ class _Selection:
         return value, np.tile(self.matrix, (len(states), 1, 1))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Update:
     """A belief after a measurement, and the innovation.
 
@@ -205,7 +205,7 @@ class Update:
     covariance: Tensor  #: Cov[y] + R of the innovation (*batch, p, p), all entries
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FilterRun:
     """A log of T steps, filtered; see ``KalmanFilter.run``.
 

@@ -72,7 +72,7 @@ _SAME_TARGET = 0.1
 _LARGEST_RESPONSE = 10.0  # change of a working response by one residual, at most
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ProcessNoise:
     """The noise of a process, an entry an output.
 
@@ -332,7 +332,7 @@ def _trained_gp(model: Any, states: Tensor, inputs: Tensor) -> _TrainedGP | None
     return _TrainedGP(gp, gp.observation_noise, features, effect)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class VaryingNoise:
     """The outputs whose noise varies, and the model that predicts it.
 

@@ -30,7 +30,7 @@ _PAIRS = 20  # successive errors, at least
 _FLOOR = 0.01  # of the learned variance: what is always left to the process
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SeparatedNoise:
     """The two parts of a model's noise.
 

@@ -55,11 +55,11 @@ def host_arrays(*tensors: Tensor) -> list[Array] | None:
     on_host = arrays is not None and all(
         tensor.dtype is torch.float64 for tensor in tensors
     )
-    return arrays if may_use_compiled(on_host) else None
+    return arrays if check_and_choose_compiled(on_host) else None
 
 
-def may_use_compiled(on_host: bool) -> bool:
-    """Whether the compiled loops evaluate, and not torch.
+def check_and_choose_compiled(on_host: bool) -> bool:
+    """Chooses: whether the compiled loops evaluate, and not torch.
 
     Args:
         on_host: Whether all numbers are float64 in host memory, and constants.

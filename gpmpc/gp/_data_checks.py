@@ -36,14 +36,7 @@ class Columns(NamedTuple):
     #: relative to; None: of the targets themselves
     magnitudes: NDArray[np.float64] | None = None
     #: what ``prior_deviation`` counts in (k,), in the units of the targets; None: those
-    deviations: NDArray[np.float64] | None = None
-
-    @property
-    def units(self) -> NDArray[np.float64]:
-        """Units that ``prior_deviation`` counts in (k,)."""
-        if self.deviations is None:
-            return np.ones(len(self.outputs))
-        return self.deviations
+    deviation_units: NDArray[np.float64] | None = None
 
     @classmethod
     def of_tensors(

@@ -5,23 +5,30 @@ r"""The SE-ARD kernel, and the Cholesky factor of its noisy matrix.
 
 ``kernel_matrix`` and ``kernel_of_squares`` are the kernel of all torch code but
 ``module``, which ONNX limits. The formula is written out again where speed or another
-language needs it; a change of the kernel is a change of each:
+language needs it; a change of the kernel is a change of each, derivatives included:
 
     gp/_likelihood               NumPy, and the gradient      tests/gp/test_likelihood
     gp/casadi_._predict_gps      CasADi                       tests/gp/test_casadi
     gp/module.PosteriorModule    torch, for ONNX              tests/gp/test_module
     _kernels/_gp_point.write_kernel     compiled              tests/kernels/test_kernels
+      its derivatives, in which beta k weighs z, as for this kernel alone:
+    _kernels/_gp_point.linearize_points, expand_points      tests/kernels/test_kernels
     _kernels/gp_rollout._write_means    compiled              tests/models/test_roll_out
     mpc/_slopes._gp_covariances  NumPy, of derivatives        tests/mpc/test_slopes
     gp/_posterior._jacobian      torch, of the mean           tests/gp/test_posterior
     gp/_sparse._cross            torch, by matrix products    tests/gp/test_sparse
+    export/gp.c                  C, with derivatives          tests/export
+    export/fixed.c, _fixed       C, exponents of base 2       tests/export
 
 (``propagation._moments`` and ``_kernels._gp_moments`` hold its expectations.)
 
 Its parameters stand elsewhere too: rows theta = (log l, log sf, log(sf / sn)) in
 ``Hyperparameters``, ``gp._search``, ``gp._training_data`` and ``gp._sparse_training``;
 the kernel's name in files, ``gp._storage`` ("SE-ARD", where they are written and read);
-and what ``from_gpytorch`` takes for it, ``gp._gpytorch._check_se_ard``.
+and what ``from_gpytorch`` takes for it, ``gp._gpytorch._check_se_ard``. ``1 / l^2`` and
+log sf2 travel packed (``_kernels.GPArrays``), from which ``learning._changed_model``
+makes a posterior and ``export._models`` tables. Another kernel is refused by name where
+closed forms need this one: ``propagation._moment_matching._exact_form``.
 """
 
 from typing import Any, NamedTuple

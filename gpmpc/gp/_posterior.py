@@ -28,7 +28,7 @@ from gpmpc._dynamics import (
     to_array,
 )
 from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays
-from gpmpc.gp._backend import may_use_compiled
+from gpmpc.gp._backend import check_and_choose_compiled
 from gpmpc.gp._kernel import factorize, kernel_matrix, kernel_of_squares
 from gpmpc.gp._scaling import Scaling
 from gpmpc.gp._tensor_checks import Predicts, check_gp_tensors
@@ -41,17 +41,17 @@ if TYPE_CHECKING:
 class AffineForm(NamedTuple):
     """A model x+ = A x + G u + c + f0(x, u) + B f(x_s, u_s).
 
-    Without f0 and angles moments go through it exactly. None stands for A = 0, G = 0,
-    c = 0, B = I, or a selection of everything; states and inputs come together.
+    Without f0 and angles moments go through it exactly.
     """
 
     f: "GPPosterior"  #: the latent functions
-    A: Tensor | None = None  #: (n, n)
-    G: Tensor | None = None  #: (n, m)
-    c: Tensor | None = None  #: (n,)
-    B: Tensor | None = None  #: (n, k)
-    states: list[int] | None = None  #: the states that f depends on
-    inputs: list[int] | None = None  #: the inputs that f depends on
+    A: Tensor | None = None  #: (n, n); None: zero
+    G: Tensor | None = None  #: (n, m); None: zero
+    c: Tensor | None = None  #: (n,); None: zero
+    B: Tensor | None = None  #: (n, k); None: the identity
+    #: the states that f depends on; None: all, and then all inputs too
+    states: list[int] | None = None
+    inputs: list[int] | None = None  #: the inputs that f depends on; None with states
     #: those of ``states`` that f sees as (sine, cosine), at their place
     angles: tuple[int, ...] = ()
     tape: Any = None  #: f0 as a ``gpmpc._kernels.tape.Tape``; None for zero
@@ -341,7 +341,7 @@ class GPPosterior(TensorModel):
 
         The compiled kernels do it where they can, else torch.
         """
-        if may_use_compiled(self._on_host):
+        if check_and_choose_compiled(self._on_host):
             from gpmpc import _kernels as kernels  # loads numba
 
             gps = kernels.linearize_gps(

@@ -47,6 +47,7 @@ _SMALL = 3e-9
 # The box holds length-scales within this factor of their feature's standard deviation.
 _LENGTHSCALE_LIMIT = 1e4
 _LOG_INTERVAL = 5.0  # [s]
+ALL_ROWS = slice(None)
 
 Penalty = Callable[[np.ndarray, np.ndarray], tuple[float, np.ndarray]]
 
@@ -88,7 +89,8 @@ class SoftLimits:
 
         Args:
             theta: (log l, log sf, log(sf / sn)) (d + 2,).
-            log_std: Logarithms of the features' standard deviations (d,).
+            log_std: Logarithms of the features' standard deviations (d,); of one that
+                never moves, of its prior length-scale.
         """
         width = np.full(len(theta), np.log(self.lengthscale_factor))
         width[-1] = np.log(self.signal_to_noise)
@@ -117,7 +119,7 @@ class SearchFeatures(NamedTuple):
     """The features of all GPs in scaled units."""
 
     points: np.ndarray  #: x~ (N, d)
-    #: standard deviations, or magnitudes of what never moves (d,); see
+    #: their units: standard deviations, or magnitudes of what never moves (d,); see
     #: ``column_scales``
     scales: np.ndarray
     constant: np.ndarray  #: which features never move (d,)
@@ -171,13 +173,13 @@ class OutputSearch:
         prior = features.prior_lengthscales
         ignored = features.constant & np.isinf(prior)
         self._log_prior = np.log(np.where(ignored, IGNORED * features.scales, prior))
-        # What length-scales are measured by: standard deviations, or the prior
-        # length-scales of features at rest.
+        # Units of the length-scales: standard deviations, or the prior length-scales
+        # of features at rest.
         at_rest = features.constant & ~ignored
-        self._log_scales = np.log(np.where(at_rest, prior, features.scales))
+        self._log_units = np.log(np.where(at_rest, prior, features.scales))
         self._log_output = np.log(output_std(targets))
         self._box = search_box(
-            self._log_scales, self._log_output, settings.signal_to_noise_limit
+            self._log_units, self._log_output, settings.signal_to_noise_limit
         )
         # Of the points of the present search; ``_use_points`` sets both.
         self._likelihood: NegativeLogMarginalLikelihood
@@ -189,7 +191,7 @@ class OutputSearch:
         self,
         first: np.ndarray | None,
         perturbations: np.ndarray,
-        rows: np.ndarray | None,
+        rows: np.ndarray | slice,
     ) -> SearchResult:
         """Searches from all starts.
 
@@ -197,8 +199,7 @@ class OutputSearch:
             first: theta of the first start (d + 2,); None takes l = std(x~),
                 sf = std(y), sn = std(y) / 10.
             perturbations: Standard normal, of the further starts (restarts, d + 2).
-            rows: The subset that the search begins with; None for all points from the
-                start.
+            rows: The subset that the search begins with, or ``ALL_ROWS``.
         """
         starts = self._starts(first, perturbations)
         self._use_points(rows)
@@ -207,8 +208,8 @@ class OutputSearch:
         if not self._is_late():
             finalists = [self._minimize(f.theta, _ITERATIONS) for f in finalists]
         best = min(finalists, key=lambda optimum: optimum.objective)
-        if rows is not None:
-            self._use_points(None)
+        if rows is not ALL_ROWS:
+            self._use_points(ALL_ROWS)
             best = self._minimize(best.theta, _ITERATIONS)
         if self._is_late():
             _log.info(
@@ -223,7 +224,7 @@ class OutputSearch:
         explored += [math.nan] * (len(starts) - len(optima))
         return SearchResult(theta, best.objective, explored)
 
-    def prior_result(self, deviation: float) -> SearchResult:
+    def result_at_rest(self, deviation: float) -> SearchResult:
         """Returns hyperparameters of an output that never changes, without a search.
 
         The likelihood only ever asks for less signal and longer length-scales: for
@@ -232,14 +233,14 @@ class OutputSearch:
         deviations of the features: among the data the output is known, far from them it
         is not. A single row leaves the noise open as well: that of the plain start.
         """
-        log_lengthscales = self._log_scales + np.log(_SMOOTH)
+        log_lengthscales = self._log_units + np.log(_SMOOTH)
         log_lengthscales[self._constant] = self._log_prior[self._constant]
         signal = max(deviation, np.abs(self._targets).max())
         ratio = min(_REPEATED, self._settings.signal_to_noise_limit)
         if len(self._targets) == 1:
             ratio = min(_PLAIN_RATIO, ratio)
         theta = np.append(log_lengthscales, [np.log(signal), np.log(ratio)])
-        self._use_points(None)
+        self._use_points(ALL_ROWS)
         value = self._likelihood(theta)[0]
         self.evaluations += 1
         objective = float(value) if np.isfinite(value) else FAILED
@@ -250,8 +251,8 @@ class OutputSearch:
         self, first: np.ndarray | None, perturbations: np.ndarray
     ) -> list[np.ndarray]:
         """The points where the exploration begins."""
-        plain = np.append(self._log_scales, [self._log_output, np.log(_PLAIN_RATIO)])
-        longer = np.append(np.full(len(self._log_scales), _LONGER), [0.0, 0.0])
+        plain = np.append(self._log_units, [self._log_output, np.log(_PLAIN_RATIO)])
+        longer = np.append(np.full(len(self._log_units), _LONGER), [0.0, 0.0])
         starts = [plain if first is None else first]
         starts += [plain + longer + shift for shift in perturbations]
         return starts
@@ -266,11 +267,10 @@ class OutputSearch:
                 break
         return optima
 
-    def _use_points(self, rows: np.ndarray | None) -> None:
-        """Takes the likelihood of some of the points; of all for None."""
-        chosen = slice(None) if rows is None else rows
-        targets = self._targets[chosen]
-        self._likelihood = NegativeLogMarginalLikelihood(self._points[chosen], targets)
+    def _use_points(self, rows: np.ndarray | slice) -> None:
+        """Takes the likelihood of some of the points."""
+        targets = self._targets[rows]
+        self._likelihood = NegativeLogMarginalLikelihood(self._points[rows], targets)
         self._size = len(targets)
 
     def _minimize(self, start: np.ndarray, iterations: int) -> Optimum:
@@ -308,7 +308,7 @@ class OutputSearch:
             value = FAILED
             gradient = np.zeros_like(theta)
         elif self._settings.penalty is not None:
-            penalty, slope = self._settings.penalty(theta, self._log_scales)
+            penalty, slope = self._settings.penalty(theta, self._log_units)
             value = value + penalty
             gradient = gradient + slope
         if time.perf_counter() - self._last_log > _LOG_INTERVAL:

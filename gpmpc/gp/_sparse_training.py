@@ -177,7 +177,7 @@ class SparseTrainer:
         objective = bound.values()
         _check_finite(objective)
         gains = _noise_alone(y) - objective
-        gains[data.unsearched_outputs] = np.inf  # there is nothing to learn of them
+        gains[data.outputs_at_rest] = np.inf  # there is nothing to learn of them
         self._check_learned(
             gains,
             exact_gains=_noise_alone(y[rows]) - exact.objective,
@@ -317,7 +317,7 @@ def _with_plain_starts(
 def _fixed_entries(theta: np.ndarray, data: TrainingData) -> np.ndarray:
     """Which entries of theta (k, d + 2) are not searched: those of what never moves."""
     fixed = np.zeros(theta.shape, dtype=bool)
-    fixed[data.unsearched_outputs] = True
+    fixed[data.outputs_at_rest] = True
     fixed[:, :-2][:, data.constants.features] = True
     return fixed
 

@@ -35,6 +35,7 @@ from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._prior_scales import PriorLengthscales
 from gpmpc.gp._scaling import Scaling, centre
 from gpmpc.gp._search import (
+    ALL_ROWS,
     FAILED,
     OutputSearch,
     Penalty,
@@ -292,7 +293,7 @@ class Trainer:
         rng = np.random.default_rng(seed)
         # The first start has none: its numbers are drawn, and left.
         perturbations = rng.normal(size=(k, self.restarts + 1, d + 2))
-        rows = self._subset_rows(size, rng, has_start=start is not None)
+        rows = self._first_rows(size, rng, has_start=start is not None)
 
         results: list[SearchResult] = []
         evaluations = 0
@@ -305,11 +306,11 @@ class Trainer:
                 deadline=self._deadline(start_time, (a + 1) / k),
             )
             with threadpool_limits(1 if size < _ONE_THREAD else None, user_api="blas"):
-                deviation = _known_deviation(data, a)
+                deviation = _deviation_at_rest(data, a)
                 if deviation is None:
                     results.append(search(first[a], perturbations[a, 1:], rows))
                 else:
-                    results.append(search.prior_result(deviation))
+                    results.append(search.result_at_rest(deviation))
             evaluations += search.evaluations
 
         objective = np.array([result.objective for result in results])
@@ -366,14 +367,14 @@ class Trainer:
             for row, constant in zip(theta, never_changed, strict=True)
         ]
 
-    def _subset_rows(
+    def _first_rows(
         self, size: int, rng: np.random.Generator, has_start: bool
-    ) -> np.ndarray | None:
-        """The rows that are searched first; None for all of them."""
+    ) -> np.ndarray | slice:
+        """The rows that are searched first."""
         if self.subset is None or size <= self.subset:
-            return None
+            return ALL_ROWS
         if has_start and not self.restarts:
-            return None  # a subset could not improve on where the search begins
+            return ALL_ROWS  # a subset could not improve on where the search begins
         return np.sort(rng.permutation(size)[: self.subset])
 
     def _deadline(self, start_time: float, part: float) -> float:
@@ -425,8 +426,8 @@ def _search_features(data: TrainingData) -> SearchFeatures:
     )
 
 
-def _known_deviation(data: TrainingData, output: int) -> float | None:
-    """The scaled prior deviation of an output that is not searched; None otherwise."""
+def _deviation_at_rest(data: TrainingData, output: int) -> float | None:
+    """The scaled prior deviation of an output at rest; None of one to be searched."""
     deviations = data.prior.deviations
     if deviations is None or not data.constants.outputs[output]:
         return None

@@ -87,8 +87,8 @@ class TrainingData:
         return column_scales(self.features.numpy(), self.constants.features)
 
     @property
-    def unsearched_outputs(self) -> NDArray[np.bool_]:
-        """Outputs (k,) that never change and have a prior deviation."""
+    def outputs_at_rest(self) -> NDArray[np.bool_]:
+        """Outputs (k,) that never change and have a prior deviation: not searched."""
         return self.constants.outputs & (self.prior.deviations is not None)
 
 
@@ -125,6 +125,9 @@ def read_training_data(
 
     if columns is None:
         columns = Columns.of_tensors(features, targets, input_dim, predicts)
+    deviation_units = columns.deviation_units
+    if deviation_units is None:
+        deviation_units = np.ones(targets.shape[1])
     data = TrainingData(
         features=features,
         targets=targets,
@@ -137,7 +140,7 @@ def read_training_data(
         prior=PriorScales.of_settings(
             settings.prior_lengthscale,
             settings.prior_deviation,
-            units=columns.units,
+            units=deviation_units,
             feature_count=d,
         ),
     )
@@ -192,7 +195,7 @@ def _warn_of_constants(data: TrainingData, resolution: float) -> None:
     prior = data.prior
     features_at_rest = data.constants.features & np.isfinite(prior.lengthscales)
     lengthscales = _distinct(prior.lengthscales[features_at_rest])
-    outputs_at_rest = data.unsearched_outputs
+    outputs_at_rest = data.outputs_at_rest
     deviations = ""
     if prior.deviations is not None:
         deviations = _distinct(prior.deviations[outputs_at_rest])

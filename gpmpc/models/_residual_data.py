@@ -146,7 +146,7 @@ def residual_columns(
         features=_feature_names(transitions, features),
         outputs=_output_names(transitions, B, pseudo_inverse),
         magnitudes=magnitudes.detach().numpy(force=True),
-        deviations=deviations.detach().numpy(force=True),
+        deviation_units=deviations.detach().numpy(force=True),
     )
 
 

@@ -48,9 +48,9 @@ _empty = np.empty
 _new = tuple.__new__
 _solve_unchecked = solve_kernel  # until a solver is made, which compiles it
 
-# What solves of one shape of G work with: the caps (M,), memory, the record's length,
-# and where x is in it. A plain tuple: taking a named one apart costs a fortieth of a
-# microsecond.
+# What solves of one shape of G work with: the caps (M,), memory
+# (``gpmpc.qp._workspace``), the length of a record (``gpmpc.qp._record``), and where x
+# is in it. A plain tuple: taking a named one apart costs a fortieth of a microsecond.
 Workplace = tuple[Array, Array, int, slice]
 
 # default limit, beyond which the iteration is taken to cycle

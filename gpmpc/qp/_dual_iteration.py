@@ -95,7 +95,7 @@ def iterate(
     constraints enter at once.
     """
     p = 0
-    candidates = guessed_count
+    entering = guessed_count
     status = SOLVED
     violated = False
     passed_over = False
@@ -108,25 +108,26 @@ def iterate(
                 status = ITERATION_LIMIT
                 break
             p = most_violated(work, violated_count)
-            candidates = 0
+            entering = 0
             if all_listed and batches_left > 0:
                 threshold = _BADLY * work.excess[p]
-                candidates = choose_badly_violated(
+                entering = choose_badly_violated(
                     work, threshold, violated_count, work.n - k
                 )
-                batches_left -= candidates > 0
+                batches_left -= entering > 0
 
         # add the candidates, or move to p, which enters unless it stays violated
         size_before = k
-        k = add_candidates(work, k, candidates)
+        k = add_candidates(work, k, entering)
         must_solve_multipliers = True
         single = not is_first_look and k == size_before
         if single:
             multiplier_before = work.multiplier[p]
-            satisfied, k, changes = _satisfy_constraint(work, k, p)
-            iterations += changes
+            attempt = _satisfy_constraint(work, k, p)
+            k = attempt.size
+            iterations += attempt.changes
             must_solve_multipliers = False
-            if not satisfied:
+            if attempt.contradicts:
                 terms = _terms_of_combination(work, k)
                 if _is_contradiction(work, p, terms):
                     _write_ray(work, k, p)
@@ -176,13 +177,19 @@ def iterate(
     )
 
 
+class _Attempt(NamedTuple):
+    """How a constraint came out of ``_satisfy_constraint``."""
+
+    contradicts: bool  # the working ones; else it is satisfied, or violated at its cap
+    size: int  # of the working set
+    changes: int  # how many constraints entered or left
+
+
 @inline_njit
 def _satisfy_constraint(work, k, p):
     """Moves multipliers until constraint p is satisfied: steps 1 and 2 of algorithm 1.
 
-    Returns:
-        False if it contradicts the working ones, the size of the working set, and how
-        many constraints entered or left.
+    A soft one may come to its cap instead, and stays violated.
     """
     mu = work.multiplier
     r = work.direction
@@ -217,7 +224,7 @@ def _satisfy_constraint(work, k, p):
             step = room
         step, blocking = _first_blocking(work, k, sense, step)
         if step == np.inf:  # (r, -1) is Farkas' proof, unless rounding violates p
-            return False, k, changes
+            return _Attempt(contradicts=True, size=k, changes=changes)
 
         # take the step
         for i in range(k):
@@ -236,9 +243,10 @@ def _satisfy_constraint(work, k, p):
             # at its cap or satisfied at zero
             mu[p] = range_end
             restore_limits(work, p)
-            return True, k, changes
+            return _Attempt(contradicts=False, size=k, changes=changes)
         else:  # full step: add p
-            return True, add_constraint(work, k, p, d), changes
+            k = add_constraint(work, k, p, d)
+            return _Attempt(contradicts=False, size=k, changes=changes)
 
 
 @inline_njit

@@ -4,9 +4,10 @@
 code has, and a *record* what a solve leaves behind (``gpmpc.qp._record``).
 
 Asking the system for memory costs as much as a small solve, so each shape of a program,
-with its last prices, and each prepared program keeps its own. Threads may share it,
-since a solve keeps the interpreter's lock. The rows of memory, all padded to the same
-length, are
+with its last prices, and each prepared program keeps its own: with the caps and the
+place of x in a record it is the program's *workplace* (``_dual_active_set``). Threads
+may share it, since a solve keeps the interpreter's lock. The rows of memory, all padded
+to the same length, are
 
     settings (1) | vectors (25) | integer vectors (4) | L | factor | rows | K
 
@@ -66,7 +67,7 @@ VECTORS = (
     "scratch",
     # By slot i < k of the working set, whose constraint is p.
     "bound",  # b_p, the bound at which p works
-    "free_value",  # c_p'x at the unconstrained minimiser
+    "free_value",  # c_p'x_u, x_u that of ``_start``: before rows came to caps
     "least_multiplier",  # [0, cap] is the range at an upper bound, [-cap, 0] at a
     "most_multiplier",  # lower one, and [-cap, cap] that of an equality
     "diagonal",  # K_pp

@@ -352,7 +352,7 @@ def test_variances_at_several_points_are_reduced_as_each_alone(size):
     def together(columns, rows, totals):
         reduce_variances(columns, len(columns), rows, totals)
 
-    expected = [alone(mine.precision.inverse_cholesky[1], row) for row in q]
+    expected = [alone(mine.quadratic_forms.inverse_cholesky[1], row) for row in q]
     totals = np.zeros(8)
     together(mine.columns[1], q, totals)
     assert np.allclose(totals, expected, rtol=1e-12, atol=0)
