@@ -51,9 +51,15 @@ from gpmpc.metrics import (
     mean_squared_error,
     negative_log_predictive_density,
 )
-from gpmpc.models._past import has_past, measured_dim, rows_before, states_along
+from gpmpc.models._past import (
+    has_past,
+    measured_dim,
+    measured_signals,
+    rows_before,
+    states_along,
+)
 from gpmpc.propagation import Propagator, best_propagator
-from gpmpc.signals import UNKNOWN, Signals, signals_of
+from gpmpc.signals import UNKNOWN, Signals
 
 if TYPE_CHECKING:
     import pandas
@@ -383,7 +389,7 @@ def _state_names(
     """Returns the names of the states, the model's or the first recording's."""
     if names:
         return tuple(names)
-    known = signals_of(model).state_names
+    known = measured_signals(model).state_names
     if not known and recordings:
         known = recordings[0].signals.state_names
     return tuple(known) or tuple(f"x{i + 1}" for i in range(measured_dim(model)))
@@ -420,7 +426,7 @@ def _check(
             f"got {sizes or 'no recording'}"
         )
     for recording in recordings:
-        signals_of(model).check("the model", recording.signals, "the recording")
+        measured_signals(model).check("the model", recording.signals, "the recording")
     back = rows_before(model)
     longest = max(map(len, recordings)) - back
     if horizon > longest:

@@ -129,7 +129,8 @@ class Gaussian:
 def _as_mean(value: Any) -> Tensor:
     """Returns a tensor, an array or a list of numbers as a tensor of floating point."""
     if isinstance(value, np.ndarray) and value.dtype in _FLOATS:
-        return torch.as_tensor(value)
+        is_reversed = any(stride < 0 for stride in value.strides)
+        return torch.as_tensor(value.copy() if is_reversed else value)
     if isinstance(value, Tensor) and _is_real(value):
         return value if value.is_floating_point() else value.to(torch.float64)
     try:

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 import torch
 
@@ -37,3 +38,7 @@ def test_a_semidefinite_matrix_is_returned_unchanged():
     projected, deficit = nearest_positive_semidefinite(root @ root.T)
     assert torch.equal(projected, (root @ root.T + (root @ root.T).T) / 2)
     assert float(deficit) == 0
+
+
+def test_an_array_that_is_read_backwards_is_a_state():
+    assert Gaussian.certain(np.arange(3.0)[::-1]).mean.tolist() == [2.0, 1.0, 0.0]

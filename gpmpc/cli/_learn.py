@@ -438,7 +438,7 @@ def _doubts(learned: IdentifiedModel, judgement: Judgement) -> list[str]:
             "from its own estimate."
         )
     doubts.append("Outside the ranges of the data (table above) nothing was seen.")
-    if getattr(nominal, "feedback", False):
+    if learned.model.feedback_outputs:
         doubts.append(
             "The term feedback describes the controller that flew: it predicts such "
             "flights, and says nothing of what another controller would do. Do not "

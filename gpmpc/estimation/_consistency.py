@@ -19,7 +19,7 @@ from torch import Tensor
 from gpmpc._angles import state_difference
 from gpmpc._calls import explains_arguments
 from gpmpc.estimation._conditioning import decorrelated
-from gpmpc.exceptions import DataError, ShapeError, check_number
+from gpmpc.exceptions import DataError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian
 
 
@@ -67,8 +67,9 @@ def normalized_errors(
 
     Raises:
         ShapeError: The two do not belong together.
-        DataError: No error is finite, or a covariance is singular: the chi-square of
-            such an error is not defined.
+        SettingError: The level is not between 0 and 1, or no error is independent.
+        DataError: No error is finite, or a covariance is not positive definite: the
+            chi-square of such an error is not defined.
 
     >>> import numpy as np
     >>> errors = np.random.default_rng(0).normal(size=(500, 2))
@@ -80,6 +81,11 @@ def normalized_errors(
     See Also:
         ``estimation_errors``; ``autocorrelation``.
     """
+    check_number("level", level)
+    if not 0 < level < 1:
+        raise SettingError("level", f"must lie between 0 and 1; got {level}")
+    if independent is not None:
+        check_number("independent", independent, least=1, whole=True)
     e = torch.as_tensor(errors, dtype=torch.float64)
     P = torch.as_tensor(covariances, dtype=torch.float64)
     n = e.shape[-1]
@@ -99,13 +105,16 @@ def normalized_errors(
     missing = missing[measured]
     P = _with_independent(P, missing)
     e = torch.where(missing, 0.0, e)
-    solutions, info = torch.linalg.solve_ex(P, e[..., None])
+    if not bool(torch.isfinite(P).all()):
+        raise DataError("the covariances must be finite; got one that is not")
+    root, info = torch.linalg.cholesky_ex(P)
     if bool(info.any()):
         raise DataError(
-            "the covariances must be positive definite; got a singular one: leave out "
+            "the covariances must be positive definite; got one that is not: leave out "
             "entries that are known exactly"
         )
-    values = (e * solutions[..., 0]).sum(-1).numpy()
+    whitened = torch.linalg.solve_triangular(root, e[..., None], upper=False)
+    values = whitened[..., 0].square().sum(-1).numpy()
     degrees = (~missing).sum(-1).numpy()
     count = len(values) if independent is None else independent
     total = float(degrees.mean()) * count
@@ -152,7 +161,7 @@ def autocorrelation(
     Raises:
         ShapeError: The two do not belong together.
         SettingError: The lag is no whole number of one or more.
-        DataError: Fewer than two pairs are finite.
+        DataError: Fewer than two pairs are finite, or all innovations are zero.
 
     >>> import numpy as np
     >>> innovations = np.random.default_rng(0).normal(size=(500, 1))
@@ -181,7 +190,10 @@ def autocorrelation(
         )
     a = first[pairs]
     b = second[pairs]
-    correlation = (a * b).sum() / np.sqrt((a**2).sum() * (b**2).sum())
+    scale = np.sqrt((a**2).sum() * (b**2).sum())
+    if not scale:
+        raise DataError("an autocorrelation needs innovations that are not all zero")
+    correlation = (a * b).sum() / scale
     limit = 1.96 / np.sqrt(len(a))
     return float(correlation), float(limit)
 

@@ -147,7 +147,7 @@ def estimate_delay(
     tails = [(1 - confidence) / 2, (1 + confidence) / 2]
     low, high = np.quantile(drawn_delays, tails, method="inverted_cdf")
     best = delays[np.argmax(scores)]
-    margin = resolution / 2 if resolution < 1 else 0.0
+    margin = 0.0 if resolution == 1 else resolution / 2
     return DelayEstimate(
         steps=float(best),
         interval=(

@@ -384,6 +384,7 @@ class KalmanFilter:
         Raises:
             ShapeError: There is not one measurement more than inputs.
         """
+        check_kind("belief", belief, Gaussian, "a Gaussian")
         belief = belief.in_order(self._names.state_names)
         inputs = _like(belief, "inputs", inputs, self._names.input_names)
         measured = _like(belief, "measurements", measured, self._measured_names)
@@ -547,11 +548,16 @@ def _check_same_type(model: DynamicsModel, measurement: Measurement) -> None:
 def _measured_names(
     measurement: Measurement, state_names: Sequence[str]
 ) -> tuple[str, ...]:
-    """Returns the names of y where it is some of the states; none otherwise."""
+    """Returns the names of y where it is some of the states; none otherwise.
+
+    None either where a state has no name, or several sensors measure it: no labels
+    could tell them apart.
+    """
     states = measurement.measured_states
-    if not state_names or states is None:
+    if states is None or max(states) >= len(state_names):
         return ()
-    return tuple(state_names[i] for i in states)
+    names = tuple(state_names[i] for i in states)
+    return names if len(set(names)) == len(names) else ()
 
 
 def _like(belief: Gaussian, key: str, value: Any, names: Sequence[str]) -> Tensor:

@@ -44,7 +44,7 @@ from torch import Tensor
 
 from gpmpc._angles import angles_of, state_difference
 from gpmpc._calls import explains_arguments
-from gpmpc._dynamics import DynamicsModel, to_array
+from gpmpc._dynamics import DynamicsModel, tensors_for, to_array
 from gpmpc.exceptions import DataError, ShapeError, UnsupportedModel, check_number
 from gpmpc.gp import (
     GPPosterior,
@@ -56,6 +56,9 @@ from gpmpc.gp import (
 from gpmpc.gp._sparse import sparse_posterior
 from gpmpc.gp._transitions import check_transitions
 from gpmpc.models import NoisyModel, ResidualModel
+from gpmpc.models._noisy import noise_features
+from gpmpc.models._residual_data import effect_matrix
+from gpmpc.models._wrapper import LinearWrapper
 
 SEARCHED = 500  # rows of the search, at most
 POINTS = 50  # inducing points of g
@@ -103,8 +106,8 @@ def estimate_process_noise(
     """Estimates the noise of a model's outputs from transitions in their order of time.
 
     Args:
-        model: Predicts next states. Rows that a ``GPPosterior`` was trained on are
-            predicted without their block.
+        model: Predicts next states. Rows that GPs of it were trained on are predicted
+            without their block; those of pseudo-observations cannot be.
         transitions: All rows of one log or several; where x[k+1] of a row is not x[k]
             of the next, a new run begins.
         block: Rows that are left out together: more than errors are correlated over.
@@ -206,8 +209,8 @@ def residuals(model: Any, transitions: Transitions, block: int) -> Residuals:
     """Computes the errors of a model's outputs at transitions.
 
     Args:
-        model: Predicts next states. Rows that a ``GPPosterior`` was trained on are
-            predicted without their block.
+        model: Predicts next states. Rows that GPs of it were trained on are predicted
+            without their block; those of pseudo-observations cannot be.
         transitions: In their order of time.
         block: Rows that are left out together.
 
@@ -222,15 +225,62 @@ def residuals(model: Any, transitions: Transitions, block: int) -> Residuals:
     x = transitions.states.to(dtype=model.dtype, device=model.device)
     u = transitions.inputs.to(dtype=model.dtype, device=model.device)
     after = transitions.next_states.to(dtype=model.dtype, device=model.device)
-    belief = model.predict(x, u)
+    return _residuals_of(model, x, u, after, block)
+
+
+def _residuals_of(
+    model: Any, states: Tensor, inputs: Tensor, next_states: Tensor, block: int
+) -> Residuals:
+    """Computes the errors of a model, whose GPs may be inside of other models.
+
+    Args:
+        model: Predicts next states.
+        states: (N, n).
+        inputs: (N, m).
+        next_states: (N, n).
+        block: Rows that are left out together.
+    """
+    if isinstance(model, NoisyModel):  # its noise is what is asked for
+        return _residuals_of(model.model, states, inputs, next_states, block)
+    if isinstance(model, LinearWrapper):
+        return _residuals_within(model, states, inputs, next_states, block)
+    belief = model.predict(states, inputs)
     in_sample = Residuals(
-        errors=state_difference(after, belief.mean, angles_of(model)),
+        errors=state_difference(next_states, belief.mean, angles_of(model)),
         latent=belief.variance,
     )
-    trained = _trained_gp(model, x, u)
+    trained = _trained_gp(model, states, inputs)
     if trained is None:
         return in_sample
     return _leave_out_blocks(trained, block, in_sample)
+
+
+def _residuals_within(
+    model: LinearWrapper,
+    states: Tensor,
+    inputs: Tensor,
+    next_states: Tensor,
+    block: int,
+) -> Residuals:
+    """Computes the errors of a linear model around another; see ``_residuals_of``.
+
+    It says z+ = [f(x, Z z + W u); 0] + L z + M u: f is to explain what the rest leaves.
+    """
+    n = model.model.state_dim
+    Z, W, L, M = tensors_for(model, *model.linear_part)
+    left = next_states - states @ L.mT - inputs @ M.mT
+    inner = _residuals_of(
+        model.model,
+        states=states[:, :n],
+        inputs=states @ Z.mT + inputs @ W.mT,
+        next_states=left[:, :n],
+        block=block,
+    )
+    further = left[:, n:]
+    return Residuals(
+        errors=torch.cat([inner.errors, further], dim=1),
+        latent=torch.cat([inner.latent, torch.zeros_like(further)], dim=1),
+    )
 
 
 def _leave_out_blocks(
@@ -257,8 +307,10 @@ def _leave_out_blocks(
             variances = covariance.diagonal() - trained.noise[a]
             latent_variances[:, a] = variances.clamp_min(0)
         # What no output of the GPs can change is left as it is.
-        errors[rows] += (left_out_errors - own_errors) @ trained.effect.mT
-        latent[rows] = latent_variances @ trained.effect.square().mT
+        effect = trained.effect[rows]
+        change = left_out_errors - own_errors
+        errors[rows] += (effect @ change[..., None])[..., 0]
+        latent[rows] = (effect.square() @ latent_variances[..., None])[..., 0]
     return Residuals(errors=errors, latent=latent)
 
 
@@ -277,11 +329,12 @@ def _rows_and_points(trained: "_TrainedGP", errors: Tensor) -> Tensor:
         Indices of rows and points (pairs, 2), in the order of the rows.
     """
     gp = trained.gp
-    effect = trained.effect
-    inverse = torch.linalg.pinv(effect)
+    inverse = torch.linalg.pinv(trained.effect)
     deviations = trained.noise.sqrt()
-    of_rows = to_array(errors @ inverse.mT / deviations)
-    of_points = to_array(trained.errors_of_points @ effect.mT @ inverse.mT / deviations)
+    of_rows = to_array((inverse @ errors[..., None])[..., 0] / deviations)
+    # (N, k, k), by which the errors of points show in those of a row.
+    visible = to_array(inverse @ trained.effect / deviations[:, None])
+    of_points = to_array(trained.errors_of_points)
     points_at = defaultdict(list)
     for point, features in enumerate(gp.features.tolist()):
         points_at[tuple(features)].append(point)
@@ -290,7 +343,8 @@ def _rows_and_points(trained: "_TrainedGP", errors: Tensor) -> Tensor:
         candidates = points_at[tuple(features)]
         if not candidates:
             continue
-        distances = np.abs(of_points[candidates] - of_rows[row]).max(axis=1)
+        of_candidates = of_points[candidates] @ visible[row].T
+        distances = np.abs(of_candidates - of_rows[row]).max(axis=1)
         nearest = int(distances.argmin())
         if distances[nearest] <= _SAME_TARGET:
             pairs.append((row, candidates.pop(nearest)))
@@ -304,7 +358,7 @@ class _TrainedGP(NamedTuple):
     gp: GPPosterior
     noise: Tensor  #: variances of the targets (k,)
     features: Tensor  #: what they see of states and inputs (N, d)
-    effect: Tensor  #: B, by which they act on the states (n, k)
+    effect: Tensor  #: B, by which they act on the states of each row (N, n, k)
 
     @property
     def errors_of_points(self) -> Tensor:
@@ -315,20 +369,21 @@ class _TrainedGP(NamedTuple):
 def _trained_gp(model: Any, states: Tensor, inputs: Tensor) -> _TrainedGP | None:
     """Finds the GPs of a model.
 
-    None where there are none, they hold pseudo-observations, or B is a function.
+    None where there are none, or they hold pseudo-observations.
     """
     if isinstance(model, GPPosterior):
         gp = model
         effect = torch.eye(gp.output_dim, dtype=gp.dtype, device=gp.device)
         features = torch.cat([states, inputs], dim=1)
-    elif isinstance(model, ResidualModel) and not callable(model.B):
+    elif isinstance(model, ResidualModel):
         gp = model.residual
-        effect = model.B
+        effect = effect_matrix(model.B, states)
         features = torch.cat(model.features(states, inputs), dim=1)
     else:
         return None
     if not isinstance(gp, GPPosterior) or gp.observation_noise is None:
         return None
+    effect = effect.expand(len(states), *effect.shape[-2:])
     return _TrainedGP(gp, gp.observation_noise, features, effect)
 
 
@@ -340,7 +395,7 @@ class VaryingNoise:
         ``estimate_varying_noise``, which returns it.
     """
 
-    #: a ``NoisyModel``; the model that was given where no output's noise varies
+    #: a ``NoisyModel``; the model inside where no output's noise varies
     model: Any
     outputs: tuple[int, ...]  #: whose noise varies
     #: log likelihood of held-out residuals less that under a constant variance (k,)
@@ -358,7 +413,8 @@ def estimate_varying_noise(
     It does so for the outputs whose data show that it depends on them.
 
     Args:
-        model: As for ``estimate_process_noise``; the mean of its next states stays.
+        model: As for ``estimate_process_noise``; the mean of its next states stays. The
+            noise of a ``NoisyModel`` is learned anew.
         transitions: All rows, in their order of time; a few hundred at least.
         block: Rows that are left out and held out together: more than errors are
             correlated over.
@@ -372,6 +428,8 @@ def estimate_varying_noise(
     See Also:
         ``gpmpc.models.NoisyModel``, which it makes.
     """
+    if isinstance(model, NoisyModel):
+        model = model.model
     left_out = residuals(model, transitions, block)
     errors = left_out.errors.cpu().double()
     latent = left_out.latent.cpu().double()
@@ -381,8 +439,9 @@ def estimate_varying_noise(
             f"got {len(errors)} rows"
         )
     squares = errors.square().clamp_min(1e-300)
-    states = transitions.states.cpu()
-    inputs = transitions.inputs.cpu()
+    seen, inputs = noise_features(model)(transitions.states, transitions.inputs)
+    states = seen.cpu()
+    inputs = inputs.cpu()
     learner = _VarianceLearner.start(states, inputs, squares, latent, seed)
     fold = torch.arange(len(squares)) // block % FOLDS
     gains = torch.zeros_like(errors)

@@ -38,8 +38,8 @@ class SeparatedNoise:
         ``separate_noise``, which returns it.
     """
 
-    #: the same predictions, with the noise of the process alone: ``noise_variance`` of
-    #: its GPs is that, ``GPPosterior.observation_noise`` still all that was learned
+    #: the same predictions, with the noise of the process alone; ``observation_noise``
+    #: of its GPs, or of a ``ResidualModel`` with its own noise, is still all of it
     model: DynamicsModel
     process: Tensor  #: variances of what moves the state in a step (n,)
     #: variances of the sensors (n,); zero where none can be told from zero
@@ -76,17 +76,11 @@ def separate_noise(
             "the noise of GPs, or of a ResidualModel with a constant B, can be "
             f"separated; got {type(model).__name__}"
         )
-    noise = gp.observation_noise
-    if noise is None:
+    if gp.observation_noise is None:
         raise UnsupportedModel(
             "the noise of GPs of observed rows can be separated, not of sparse ones"
         )
-    # All that was learned, also where it was separated before.
-    gp_with_all = replace(gp, noise_variance=noise)
-    if isinstance(model, ResidualModel):
-        model = replace(model, residual=gp_with_all)
-    else:
-        model = gp_with_all
+    model = _with_all_noise(model)
     errors = to_array(residuals(model, transitions, block).errors)
     successive = follows_previous(model, transitions)
     later = 1 + np.flatnonzero(successive.cpu().numpy())
@@ -114,6 +108,21 @@ def separate_noise(
         model=_with_noise(model, process_variance),
         process=process_variance,
         measurement=torch.from_numpy(measurement),
+    )
+
+
+def _with_all_noise(model: GPPosterior | ResidualModel) -> Any:
+    """Returns a model with all that was learned, also where it was separated before."""
+    if isinstance(model, GPPosterior):
+        return replace(model, noise_variance=model.observation_noise)
+    residual = _with_all_noise(model.residual)
+    if model.observation_noise is None:
+        return replace(model, residual=residual)
+    return replace(
+        model,
+        residual=residual,
+        noise=model.observation_noise,
+        observation_noise=None,
     )
 
 
@@ -149,7 +158,8 @@ def _with_noise(model: GPPosterior | ResidualModel, process: Tensor) -> Any:
     if model.noise is not None:
         learned = model.noise.diagonal().clamp_min(smallest)
         root = (process.to(learned) / learned).sqrt()
-        return replace(model, noise=root[:, None] * model.noise * root)
+        noise = root[:, None] * model.noise * root
+        return replace(model, noise=noise, observation_noise=model.noise)
     B = torch.as_tensor(model.B).to(gp.noise_variance)
     learned = (B.square() @ gp.noise_variance).clamp_min(smallest)
     # Of each output the largest part that a state it acts on has left; all of one that

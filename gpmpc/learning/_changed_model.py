@@ -60,7 +60,7 @@ class Comparison(NamedTuple):
         return max(-LARGEST_LEAD, min(lead, LARGEST_LEAD))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ChangedModel(Wrapper):
     """A model and its change.
 

@@ -8,9 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._angles import TURN, whole_turns
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, to_array
 from gpmpc.exceptions import ShapeError, UnsupportedModel
+
+_POINTS = 3  # at which a function shows whether it wraps an angle
 
 
 @explains_arguments
@@ -53,6 +56,7 @@ class CasadiFunction:
         self.shape = function.size1_out(0), function.size2_out(0)
         self.sizes = [function.size1_in(i) for i in range(function.n_in())]
         self._mapped_expansions: dict[int, Any] = {}  # by the number of points
+        self._counting: dict[tuple[int, ...], CasadiFunction] = {}  # by the angles
 
     @cached_property
     def _expansion(self) -> Any:
@@ -92,13 +96,57 @@ class CasadiFunction:
         """
         self._check_widths(arguments)
         like = arguments[0]
+        count = like.shape[:-1].numel()
         points = [
-            to_array(argument).reshape(-1, size)
+            to_array(argument).reshape(count, size)
             for argument, size in zip(arguments, self.sizes, strict=True)
         ]
         values, *_ = self.linearize(*points)
         value = torch.as_tensor(values, dtype=like.dtype, device=like.device)
         return value.reshape(*like.shape[:-1], *value.shape[1:])
+
+    def counting_turns(self, angles: tuple[int, ...]) -> "CasadiFunction":
+        """Returns the function of next states, with angles that count turns.
+
+        It is the function itself, unless it wraps an angle: then its angles are those
+        within half a turn of the state's.
+
+        Args:
+            angles: Indices of the states, and so of the value, that are angles [rad].
+        """
+        if angles not in self._counting:
+            wrapped = [i for i in angles if self._wraps(i)]
+            counting = self._unwrapped(wrapped) if wrapped else self
+            self._counting[angles] = counting
+        return self._counting[angles]
+
+    def _wraps(self, angle: int) -> bool:
+        """Returns whether a turn more of an angle is none of its next value."""
+        rng = np.random.default_rng(0)
+        points = [rng.uniform(-1.0, 1.0, (_POINTS, size)) for size in self.sizes]
+        before, *_ = self.linearize(*points)
+        points[0][:, angle] += TURN
+        after, *_ = self.linearize(*points)
+        change = after[:, angle] - before[:, angle]
+        return bool((whole_turns(change) == 0.0).all())
+
+    def _unwrapped(self, angles: Sequence[int]) -> "CasadiFunction":
+        """Returns the function with whole turns between value and state left out."""
+        import casadi
+
+        function = self.function
+        symbol = casadi.MX.sym if self.tape is None else casadi.SX.sym
+        arguments: list[Any] = [
+            symbol(f"x{i}", size) for i, size in enumerate(self.sizes)
+        ]
+        if self.tape is not None and not function.is_a("SXFunction"):
+            function = function.expand()
+        entries: list[Any] = casadi.vertsplit(function(*arguments))
+        for i in angles:
+            turns = casadi.floor((entries[i] - arguments[0][i]) / TURN + 0.5)
+            entries[i] = entries[i] - TURN * turns
+        value = casadi.vertcat(*entries)
+        return CasadiFunction(casadi.Function("counting", arguments, [value]))
 
     def linearize(self, *arguments: Array) -> tuple[Array, ...]:
         """Computes values and derivatives at K points.

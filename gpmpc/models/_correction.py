@@ -40,7 +40,7 @@ class Prior(NamedTuple):
     movement: float = 1.0  #: share of the predicted movement that it keeps
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Correction:
     """Linear corrections of rollouts at some steps, and between them."""
 
@@ -99,8 +99,9 @@ class Correction:
     def __call__(self, windows: Windows, predicted: Array) -> Array:
         """Corrects rollouts (W, K, n).
 
-        It is linear between its steps. After the last one it fades, to nothing at twice
-        as many steps: the past has said what it has to say.
+        It is linear between its steps; where the rollouts end between two of them, the
+        correction of the last step that they reach is held. After the last of all it
+        fades, to nothing at twice as many steps: the past has said what it has to say.
         """
         knots = [0]
         corrections = [np.zeros((len(windows), self.weights.shape[-1]))]
@@ -127,7 +128,7 @@ class Correction:
         return z @ self.weights[i]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StartFilter:
     """Linear estimate of the state that a rollout begins in, from noisy rows."""
 

@@ -18,9 +18,11 @@ from gpmpc.models._past import has_past, measured_dim, rows_before
 from gpmpc.models._wrapper import LinearPart, LinearWrapper
 from gpmpc.signals import signals_of
 
+_DIGITS = 9  # of a delay in steps, behind the point
+
 
 @explains_arguments
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DelayedModel(LinearWrapper):
     """A model whose input acts late, by a whole or a fractional number of steps.
 
@@ -48,6 +50,9 @@ class DelayedModel(LinearWrapper):
     delay: float  #: in steps, more than zero; a fraction is allowed
 
     def __post_init__(self) -> None:
+        check_number("delay", self.delay, unit="[steps]")
+        # 0.3 / 0.1 is less than 3, by round-off.
+        object.__setattr__(self, "delay", round(self.delay, _DIGITS))
         check_number("delay", self.delay, above=0, unit="[steps]")
         check_next_states(self.model)
 

@@ -19,7 +19,7 @@ from gpmpc.signals import signals_of
 
 
 @explains_arguments
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DisturbedModel(LinearWrapper):
     """A model with disturbances as further states (x, d) that a filter estimates.
 
@@ -31,7 +31,8 @@ class DisturbedModel(LinearWrapper):
     is an AR(1) process that fades, as wind does. Predicted with the state it leaves no
     offset from a reference (Pannocchia and Rawlings, 2003), and its uncertainty is part
     of the tube. For a rigid body, columns of E of the velocities are a force over the
-    mass, those of the rates a torque.
+    mass, those of the rates a torque. Of a model with a past, such as a
+    ``DelayedModel``, the filter estimates the past as well: a loop keeps it no longer.
 
     Raises:
         ShapeError: E has another number of rows than the model has states.

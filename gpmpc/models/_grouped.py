@@ -50,6 +50,19 @@ class GroupedNominal:
             starts.append(part.start if len(part.start) == size else np.zeros(size))
         return np.concatenate(starts)
 
+    @property
+    def sees_inputs(self) -> bool:
+        """Whether the outputs of any part are functions of the inputs."""
+        return any(part.sees_inputs for part in self.parts)
+
+    @property
+    def feedback_outputs(self) -> tuple[int, ...]:
+        """Indices of the outputs that hold the feedback of the controller that flew."""
+        indices: list[int] = []
+        for part, outputs in zip(self.parts, self.outputs_of, strict=True):
+            indices += [i for i in outputs if i in part.feedback_outputs]
+        return tuple(sorted(indices))
+
     def outputs(
         self, theta: Any, states: Array, inputs: Array, context: Array
     ) -> Array:

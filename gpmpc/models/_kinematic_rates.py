@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gpmpc._angles import state_difference
+from gpmpc._angles import state_difference, wrap
 from gpmpc.models._features import Features
 from gpmpc.models._nominal import Affine
 from gpmpc.models._residual_data import Nominal, nominal_next_state
@@ -33,7 +33,7 @@ _SIGNIFICANT = 3.0  # standard errors from which on c is another one, or a part 
 _ROWS_PER_TERM = 3  # of the regressions
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KinematicResidual:
     """What of a model is known by its rates, and what is left to learn."""
 
@@ -76,6 +76,8 @@ def kinematic_residual(
         unexplained = change[:, position]
         if nominal is None:
             unexplained = unexplained - time_step * states[:, rate]
+            if position in features.angles:  # a turn too much may be of either part
+                unexplained = wrap(unexplained)
         rate_change = time_step * change[:, rate]
         c = _integration_coefficient(unexplained, rate_change, basis)
         remainder = unexplained - c * rate_change

@@ -110,7 +110,7 @@ class LogDynamics:
 
     def __post_init__(self) -> None:
         reason = ""
-        if getattr(self.model.nominal, "feedback", False):
+        if self.model.feedback_outputs:
             reason = "holds the feedback of the controller that flew"
         elif not self._sees_inputs:
             reason = "moves in the same way whatever the inputs are"
@@ -123,7 +123,7 @@ class LogDynamics:
         """Whether any part of the model is a function of the inputs."""
         model = self.model
         learned = bool(model.gps) or bool(model.weights.any())
-        return learned or getattr(model.nominal, "fitted", True)
+        return learned or model.nominal.sees_inputs
 
     @property
     def measured_dim(self) -> int:

@@ -34,7 +34,7 @@ DIVERGED = 1e9  # error of a rollout that is not finite
 LAG_ROWS = 40  # from which the state of first-order lags is known
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OutputGP:
     """GPs that add to some outputs of the nominal model."""
 
@@ -122,6 +122,12 @@ class LogModel:
         if self.correction is None and self.start_filter is None:
             return rows
         return max(rows, *LAGS)
+
+    @property
+    def feedback_outputs(self) -> tuple[int, ...]:
+        """Indices of the outputs that hold the feedback of the controller that flew."""
+        of_nominal = self.nominal.feedback_outputs
+        return tuple(i for i in of_nominal if i not in self.without_nominal)
 
     @property
     def parameters(self) -> list[list[float]]:

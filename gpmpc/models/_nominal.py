@@ -25,7 +25,7 @@ from gpmpc.signals import UNKNOWN, Signals
 
 
 @explains_arguments
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Affine:
     """A nominal model x+ = A x + B u + c, through which uncertainty goes exactly.
 
@@ -34,8 +34,9 @@ class Affine:
         SettingError: One of the three is no tensor.
 
     >>> import torch
-    >>> double = Affine(torch.eye(2), B=torch.ones(2, 1), c=torch.zeros(2))
-    >>> double(torch.tensor([1.0, 2.0]), torch.tensor([0.5])).tolist()
+    >>> both = torch.tensor([[1.0], [1.0]], dtype=torch.float64)
+    >>> f0 = Affine(torch.eye(2).double(), B=both, c=torch.zeros(2).double())
+    >>> f0(torch.tensor([1.0, 2.0]).double(), torch.tensor([0.5]).double()).tolist()
     [1.5, 2.5]
 
     See Also:
@@ -92,7 +93,7 @@ class Affine:
 
 
 @explains_arguments
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class KnownModel:
     """A known function x+ = f0(x, u) as a model without uncertainty.
 

@@ -32,6 +32,16 @@ class ParametricNominal(Protocol):
         """Parameters at which a fit begins (P,)."""
         ...
 
+    @property
+    def sees_inputs(self) -> bool:
+        """Whether the outputs are functions of the inputs."""
+        ...
+
+    @property
+    def feedback_outputs(self) -> tuple[int, ...]:
+        """Indices of the outputs that hold the feedback of the controller that flew."""
+        ...
+
     def outputs(
         self, theta: Any, states: Array, inputs: Array, context: Array
     ) -> Array:
@@ -66,6 +76,7 @@ class MultirotorNominal:
     #: at which ``thrust`` and ``torque`` are stated [V]; zero leaves the voltage out
     voltage: float = 0.0
     thrusts: bool = False  #: whether the inputs are thrusts instead of speeds
+    sees_inputs = True
 
     def __post_init__(self) -> None:
         if self.motors < 1:
@@ -92,6 +103,11 @@ class MultirotorNominal:
         start[0] = 20.0
         start[3:6] = 5.0
         return start
+
+    @property
+    def feedback_outputs(self) -> tuple[int, ...]:
+        """Indices of the outputs that hold the controller's feedback: about x and y."""
+        return (3, 4) if self.feedback else ()
 
     def outputs(
         self, theta: Any, states: Array, inputs: Array, context: Array
@@ -145,6 +161,12 @@ class AffineNominal:
     fitted: bool = True  #: otherwise the outputs are zero
     parameter_names = ()
     start = np.empty(0)
+    feedback_outputs = ()
+
+    @property
+    def sees_inputs(self) -> bool:
+        """Whether the outputs are functions of the inputs."""
+        return self.fitted
 
     def outputs(
         self, theta: Any, states: Array, inputs: Array, context: Array

@@ -69,6 +69,11 @@ def weighed_signals(model: DynamicsModel, problem: Any) -> Signals:
     return first_signals(signals_of(model), weighed_dim(model, problem))
 
 
+def measured_signals(model: Any) -> Signals:
+    """Returns the signals of a model, of the states that are measured."""
+    return first_signals(signals_of(model), measured_dim(model))
+
+
 def first_signals(signals: Signals, states: int) -> Signals:
     """Returns signals without the names of states beyond a number of them."""
     if len(signals.state_names) <= states:

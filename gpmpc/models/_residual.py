@@ -18,6 +18,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
+from gpmpc._angles import full_turns
 from gpmpc._dynamics import (
     Array,
     Linearized,
@@ -47,6 +48,7 @@ from gpmpc.models._residual_data import (
     Effect,
     Nominal,
     check_derivatives,
+    counts_turns,
     effect_matrix,
     nominal_next_state,
     residual_columns,
@@ -56,7 +58,7 @@ from gpmpc.models._tensors import check_like, move
 from gpmpc.signals import UNKNOWN, Signals, check_signals
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ResidualModel(TensorModel):
     """A nominal model and a GP on its residual.
 
@@ -97,6 +99,8 @@ class ResidualModel(TensorModel):
     #: which needs a constant B
     noise: Tensor | None = None
     signals: Signals = UNKNOWN  #: names and time step of the data, where they are known
+    #: all noise of the observations (n, n), where ``noise`` is the process' part alone
+    observation_noise: Tensor | None = None
 
     _part = property(lambda self: self.residual)
     to = move
@@ -104,6 +108,9 @@ class ResidualModel(TensorModel):
     def __post_init__(self) -> None:
         self._check_kinds()
         self._check_sizes()
+        if isinstance(self.nominal, CasadiFunction):
+            counting = self.nominal.counting_turns(tuple(self.angles))
+            object.__setattr__(self, "nominal", counting)
         check_signals(self.signals)
         self.signals.check_sizes(self.state_dim, self.input_dim)
         self._check_tensors()
@@ -144,6 +151,8 @@ class ResidualModel(TensorModel):
             self._check_tensor("B", self.B, (n, self.residual.output_dim))
         if self.noise is not None:
             self._check_tensor("noise", self.noise, (n, n))
+        if self.observation_noise is not None:
+            self._check_tensor("observation_noise", self.observation_noise, (n, n))
         if isinstance(self.nominal, Affine):
             self._check_tensor("nominal.A", self.nominal.A, (n, n))
             self._check_tensor("nominal.B", self.nominal.B, (n, m))
@@ -304,10 +313,7 @@ class ResidualModel(TensorModel):
             inputs: (K, m).
             covariance: Whether the covariances at the points are computed.
         """
-        nominal = self.nominal
-        if not hasattr(nominal, "linearize"):
-            nominal = partial(nominal_next_state, nominal, angles=self.angles)
-        f0, A, G = linearize_function(nominal, self, states, inputs)
+        f0, A, G = self._linearize_nominal(states, inputs)
         features, selected_inputs, slopes = self.features.linearize(states, inputs)
         d = self.residual.linearize(features, selected_inputs, covariance)
         by_state, by_input = self.features.chain(d.A, d.B, slopes)
@@ -321,6 +327,20 @@ class ResidualModel(TensorModel):
             V = B @ d.covariance @ B.swapaxes(-1, -2)
         mean = f0 + (B @ d.mean[..., None])[..., 0]
         return Linearized(mean, A + B @ by_state, G + B @ by_input, V)
+
+    def _linearize_nominal(self, states: Array, inputs: Array) -> tuple[Array, ...]:
+        """Computes f0 (K, n), and its derivatives by state and input.
+
+        Its angles count turns, as those of the states do.
+        """
+        nominal = self.nominal
+        if not hasattr(nominal, "linearize"):
+            nominal = partial(nominal_next_state, nominal, angles=self.angles)
+            return linearize_function(nominal, self, states, inputs)
+        f0, A, G = linearize_function(nominal, self, states, inputs)
+        if not counts_turns(nominal):
+            f0 = f0 - full_turns(f0 - states, self.angles)
+        return f0, A, G
 
     def _linearize_effect(self, states: Array) -> tuple[Array, Array]:
         """Computes B (K, n, k) and its derivatives by the state (K, n, k, n)."""
@@ -383,6 +403,7 @@ def train_residual(
         nominal = Affine.identity(n, m)
     if B is None:
         B = torch.eye(n, dtype=torch.float64)
+    _check_types(nominal, B, transitions)
     features = Features(
         states=list(range(n) if states is None else states),
         inputs=list(range(m) if inputs is None else inputs),
@@ -396,7 +417,7 @@ def train_residual(
         B=B,
         features=features,
         transitions=transitions,
-        like=B if isinstance(B, Tensor) else transitions.states,
+        like=transitions.states,
     )
     warn_of_transitions(transitions)
     warn_of_turns(transitions, angles)
@@ -420,6 +441,21 @@ def train_residual(
         signals=transitions.signals,
     )
     return replace(training, posterior=cast(Any, model))
+
+
+def _check_types(nominal: Nominal, B: Effect, transitions: Transitions) -> None:
+    """Raises ``SettingError`` of tensors of another type or device than the data's."""
+    parts = {}
+    if isinstance(B, Tensor):
+        parts["B"] = B
+    if isinstance(nominal, Affine):
+        parts |= {
+            "nominal.A": nominal.A,
+            "nominal.B": nominal.B,
+            "nominal.c": nominal.c,
+        }
+    for name, part in parts.items():
+        check_like(name, part, transitions.states, owner="the transitions")
 
 
 def _mean_noise(residual: GPPosterior, B: Effect, transitions: Transitions) -> Tensor:

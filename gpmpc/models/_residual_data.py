@@ -17,8 +17,10 @@ from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp import Transitions
 from gpmpc.gp._data_checks import RESOLUTION, Columns, signal_names
+from gpmpc.models._casadi_function import CasadiFunction
 from gpmpc.models._features import Features
-from gpmpc.models._nominal import linearize_function
+from gpmpc.models._nominal import Affine, linearize_function
+from gpmpc.models._tensors import check_like
 
 Nominal = Callable[[Tensor, Tensor], Tensor]
 Array = NDArray[np.float64]
@@ -31,7 +33,8 @@ def nominal_next_state(
     """Computes f0 (*batch, n) with a check of its shape.
 
     A wrong number of states would otherwise be broadcast. A function that wraps angles
-    gives them within half a turn of the state's: plans count turns.
+    gives them within half a turn of the state's: plans count turns. A
+    ``CasadiFunction`` of a model counts them itself.
 
     Raises:
         SettingError: The value is no tensor.
@@ -45,7 +48,7 @@ def nominal_next_state(
         rule = "nominal must give next states of the states' shape"
         got = tuple(value.shape)
         raise ShapeError(f"{rule} {tuple(state.shape)}; got {got}")
-    if not len(angles) or hasattr(nominal, "linearize"):
+    if not len(angles) or counts_turns(nominal):
         return value
     columns = list(angles)
     turns = torch.zeros_like(value)
@@ -53,11 +56,17 @@ def nominal_next_state(
     return value - turns
 
 
+def counts_turns(nominal: Nominal) -> bool:
+    """Returns whether a nominal model needs no help in counting turns of angles."""
+    return isinstance(nominal, Affine | CasadiFunction)
+
+
 def effect_matrix(B: Effect, state: Tensor) -> Tensor:
     """Computes B (n, k), or of a function (*batch, n, k), at states (*batch, n).
 
     Raises:
         ShapeError: It has another number of rows.
+        SettingError: A function gives another type than the state's.
     """
     if not callable(B):
         check_tensors(B=B)
@@ -65,6 +74,7 @@ def effect_matrix(B: Effect, state: Tensor) -> Tensor:
         return B
     value: Any = call("B", B, state)
     check_tensors(B=value)
+    check_like("B", value, state, owner="the states")
     if value.shape == state.shape:  # one output
         value = value[..., None]
     _check_rows(value, state.shape)

@@ -84,7 +84,7 @@ class RollOut:
         if disturbance is None:
             disturbance = np.zeros(n)
         disturbance = np.ascontiguousarray(disturbance, dtype=float)
-        self._check_shapes(start, feedback.inputs, disturbance)
+        self._check_shapes(start, feedback, disturbance)
         if self._compiled_model is None:
             return self._stage_by_stage(start, feedback, disturbance)
         states = np.empty((T, H + 1, n))
@@ -134,17 +134,39 @@ class RollOut:
         states, _ = self(start, no_feedback, disturbance)
         return states
 
-    def _check_shapes(self, start: Array, inputs: Array, disturbance: Array) -> None:
+    def _check_shapes(
+        self, start: Array, feedback: Feedback, disturbance: Array
+    ) -> None:
         """Raises ``ShapeError`` unless compiled code may read them unchecked."""
-        T, H, _ = inputs.shape
+        T, H, _ = feedback.inputs.shape
         n = self._model.state_dim
-        expected = ((T, n), (T, H, self._model.input_dim), (n,))
-        got = (start.shape, inputs.shape, disturbance.shape)
+        m = self._model.input_dim
+        expected = ((T, n), (T, H, m), (n,))
+        got = (start.shape, feedback.inputs.shape, disturbance.shape)
         if got != expected:
             raise ShapeError(
                 "start (T, n), inputs (T, H, m) and disturbance (n,) must be "
                 f"{', '.join(map(str, expected))}; got {', '.join(map(str, got))}"
             )
+        plans, stages, *_ = feedback.states.shape
+        bounds = (
+            feedback.lower.shape,
+            feedback.upper.shape,
+            feedback.rate_lower.shape,
+            feedback.rate_upper.shape,
+        )
+        fits = (
+            feedback.states.shape == (T, stages, n)
+            and plans == T
+            and stages >= H
+            and feedback.gains.shape in ((1, H, m, n), (T, H, m, n))
+            and bounds == ((H, m),) * 4
+            and feedback.previous_input.shape == (m,)
+        )
+        if not fits:
+            shapes = {name: part.shape for name, part in feedback._asdict().items()}
+            rule = f"a feedback must be of {T} plans of {H} stages, {n} states"
+            raise ShapeError(f"{rule} and {m} inputs; got {shapes}")
 
     def _stage_by_stage(
         self, start: Array, feedback: Feedback, disturbance: Array

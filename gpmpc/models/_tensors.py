@@ -30,8 +30,15 @@ def move(model: Any, device: Any = None, dtype: torch.dtype | None = None) -> An
     return type(model)(**parts)
 
 
-def check_like(name: str, part: Any, model: Any) -> None:
-    """Raises ``SettingError`` unless a part has the type and the device of a model."""
-    if (part.dtype, part.device) != (model.dtype, model.device):
-        rule = f"must be {model.dtype} on {model.device} like the model"
+def check_like(name: str, part: Any, whole: Any, owner: str = "the model") -> None:
+    """Raises ``SettingError`` unless a part has the type and device of the whole.
+
+    Args:
+        name: Of the part, for the message.
+        part: A tensor, or a model.
+        whole: Likewise.
+        owner: What the whole is, for the message.
+    """
+    if (part.dtype, part.device) != (whole.dtype, whole.device):
+        rule = f"must be {whole.dtype} on {whole.device} like {owner}"
         raise SettingError(name, f"{rule}; got {part.dtype} on {part.device}")

@@ -10,7 +10,7 @@ from gpmpc._dynamics import Array
 from gpmpc.models._state_space import StateSpace
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Windows:
     """W windows of a log: the measured past and what came after it.
 

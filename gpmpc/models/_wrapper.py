@@ -55,10 +55,14 @@ class Wrapper(TensorModel):
 
     @property
     def signals(self) -> Signals:
-        """Names and time step, where the model knows them, with further states."""
+        """Names and time step, where the model knows them, with further states.
+
+        Of a model that names no more than the first of its states, these names alone.
+        """
         inner = signals_of(self.model)
         further_names = self._further_names
-        if not further_names or not inner.state_names:
+        names_all = len(inner.state_names) == self.model.state_dim
+        if not further_names or not names_all:
             return inner
         names = (*inner.state_names, *further_names)
         are_distinct = len(set(names)) == len(names)  # not so of a delay around a delay

@@ -14,7 +14,7 @@ from gpmpc._dynamics import DynamicsModel, to_array
 from gpmpc.exceptions import ShapeError
 from gpmpc.gp import GPPosterior
 from gpmpc.models import LogDynamics, ResidualModel, RigidBodyKinematics
-from gpmpc.models._past import measured_dim
+from gpmpc.models._past import measured_dim, measured_signals
 from gpmpc.mpc._controller import read_reference
 from gpmpc.signals import signals_of
 
@@ -80,8 +80,11 @@ def beyond_data(model: DynamicsModel, reference: Any) -> list[BeyondData]:
         ``BeyondData``; ``gpmpc.datasets.RandomData`` for data that reach
         farther.
     """
+    followed = read_reference(reference)
     signals = signals_of(model)
-    states = np.atleast_2d(read_reference(reference).in_order(signals).states)
+    if np.shape(followed.states)[-1:] == (measured_dim(model),):
+        signals = measured_signals(model)
+    states = np.atleast_2d(followed.in_order(signals).states)
     states = np.asarray(states, dtype=float)
     columns = _columns(model)
     if not columns:

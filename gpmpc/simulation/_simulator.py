@@ -38,7 +38,7 @@ _INITIAL_DEVIATION = 0.1  # of a model loop that starts from a mean
 
 
 @explains_arguments
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ModelLoop:
     """A learned model rolled on itself.
 

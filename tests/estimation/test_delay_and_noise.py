@@ -1,6 +1,8 @@
 """A delay is found in a log with an interval that holds it, and noise where a posterior
 has learned too little."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +10,7 @@ import torch
 from gpmpc.estimation import estimate_delay, estimate_process_noise, with_process_noise
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gp import GPPosterior, SparseTrainer, Trainer, Transitions
-from gpmpc.models import Affine, ResidualModel
+from gpmpc.models import Affine, DelayedModel, NoisyModel, ResidualModel
 from gpmpc.propagation import Linearization
 
 STEP = 0.05
@@ -359,3 +361,68 @@ def test_misuse_is_refused():
             estimate_delay(states, inputs, longest=3, **settings)
     with pytest.raises(DataError, match="must be finite"):
         estimate_delay(np.where(states > 1, np.nan, states) * np.nan, inputs)
+
+
+def late(data, delay):
+    """Rows of (x, u_{k-1}, ..), whose inputs act late, and those that acted."""
+    inputs = torch.zeros(len(data) + delay, 1)
+    inputs[delay:] = data.inputs
+    acting = inputs[: len(data)]
+    queue = [inputs[i : i + len(data)] for i in range(delay)]
+    moved = [inputs[i + 1 : i + 1 + len(data)] for i in range(delay)]
+    states = torch.cat([data.states, *queue], dim=1)
+    after = torch.cat([data.next_states, *moved], dim=1)
+    return (
+        Transitions(states, data.inputs, after),
+        Transitions(data.states, acting, data.next_states),
+    )
+
+
+def test_rows_of_a_model_inside_of_others_are_left_out_as_well():
+    whole, inner = late(transitions(*log(60, 2, 3, std=(2e-3, 0.03))), 2)
+    model = Trainer(predicts="difference", restarts=0)(inner).posterior
+    expected = estimate_process_noise(model, inner).variance
+    delayed = DelayedModel(model, 2)
+    variance = estimate_process_noise(delayed, whole).variance
+    assert torch.allclose(variance[:2], expected, rtol=1e-9)
+    assert not variance[2:].any()
+    g = replace(model, predicts="value")
+    noisy = NoisyModel(model, g, [0, 1])
+    assert torch.allclose(estimate_process_noise(noisy, inner).variance, expected)
+
+
+@pytest.mark.parametrize("varies", [False, True])
+def test_rows_of_a_residual_whose_effect_varies_are_left_out_as_well(varies):
+    data = transitions(*log(60, 0, 3, std=(2e-3, 0.03)))
+
+    def effect(x):
+        column = torch.stack([0.05 + 0.0 * x[..., 0], 1.0 + varies * x[..., 0]], dim=-1)
+        return column[..., None]
+
+    nominal = Affine.identity(2, 1)
+    model = ResidualModel.train(nominal, data, effect, trainer=Trainer(restarts=0))
+    squares = []
+    for first in range(0, 60, 20):
+        block = data[first : first + 20]
+        without = replace(
+            model,
+            residual=without_rows(model.residual, range(first, first + 20)),
+        )
+        belief = without.predict(block.states, block.inputs)
+        squares.append((block.next_states - belief.mean).square() - belief.variance)
+    variance = estimate_process_noise(model, data).variance
+    assert torch.allclose(variance, torch.cat(squares).mean(0), rtol=1e-6)
+
+
+def test_a_coarse_delay_has_an_interval_that_holds_those_between():
+    rng = np.random.default_rng(0)
+    inputs = np.repeat(rng.normal(size=(80, 1)), 3, axis=0)
+    acting = np.zeros((240, 1))
+    acting[4:] = 0.6 * inputs[:-4] + 0.4 * inputs[1:-3]  # 3.6 steps late
+    states = np.vstack([[0.0], acting]).cumsum(axis=0)
+    states += 1e-3 * rng.normal(size=states.shape)
+    steps = {
+        resolution: estimate_delay(states, inputs, 6, resolution, resamples=60).interval
+        for resolution in (1, 2)
+    }
+    assert steps == {1: (4.0, 4.0), 2: (3.0, 5.0)}

@@ -5,6 +5,7 @@ from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -27,6 +28,7 @@ from gpmpc.propagation import (
     MonteCarlo,
     Unscented,
 )
+from gpmpc.signals import Signals
 from gpmpc.testing import check_model
 
 F = torch.float64
@@ -528,7 +530,7 @@ def test_white_innovations_of_correlated_sensors_are_white():
         (
             lambda m: normalized_errors(np.ones((3, 2)), np.ones((3, 2, 2))),
             DataError,
-            "must be positive definite; got a singular one",
+            "must be positive definite; got one that is not",
         ),
         (
             lambda m: autocorrelation(np.ones((5, 2)), np.ones((5, 2, 2)), lag=0),
@@ -601,6 +603,38 @@ def test_white_innovations_of_correlated_sensors_are_white():
             DataError,
             "no error is finite",
         ),
+        (
+            lambda m: normalized_errors([[1.0]], [[[-1.0]]]),
+            DataError,
+            "must be positive definite",
+        ),
+        (
+            lambda m: normalized_errors([[1.0]], [[[np.nan]]]),
+            DataError,
+            "must be finite",
+        ),
+        (
+            lambda m: normalized_errors([[1.0]], [[[1.0]]], level=95),
+            SettingError,
+            "level: must lie between 0 and 1",
+        ),
+        (
+            lambda m: normalized_errors([[1.0]], [[[1.0]]], independent=0),
+            SettingError,
+            "independent: must be a whole number",
+        ),
+        (
+            lambda m: autocorrelation(np.zeros((5, 1)), np.ones((5, 1, 1))),
+            DataError,
+            "not all zero",
+        ),
+        (
+            lambda m: KalmanFilter(LINEAR, m).run(
+                np.zeros(2), np.zeros((2, 1)), np.zeros((3, 1))
+            ),
+            SettingError,
+            "belief: must be a Gaussian",
+        ),
     ],
 )
 def test_misuse_is_refused(make, error, rule):
@@ -619,3 +653,14 @@ def test_the_figure_shows_measured_innovations_and_those_outside():
     white = run.innovations[:, 0] / run.innovation_covariances[:, 0, 0].sqrt()
     assert np.allclose(points[0], white)
     assert "10 % missing" in axes[1].lines[0].get_label()
+
+
+def test_labels_that_two_sensors_share_are_taken_as_they_stand():
+    named = Known(LINEAR.function, [0.05, 0.1])
+    named.signals = Signals(["angle", "rate"])
+    sensor = Measurement.of_states(2, [0, 0, 1], [0.1, 0.2, 0.1])
+    labels = ["angle", "angle", "rate"]
+    table = pd.DataFrame([[0.1, 0.2, 0.3]] * 3, columns=labels)
+    plain = KalmanFilter(LINEAR, sensor).run(PRIOR, np.zeros((2, 1)), table.to_numpy())
+    found = KalmanFilter(named, sensor).run(PRIOR, np.zeros((2, 1)), table)
+    assert torch.equal(found.filtered.mean, plain.filtered.mean)

@@ -128,6 +128,10 @@ def test_a_separated_noise_reaches_every_form_of_a_residual_model():
     own = replace(model, noise=model.noise_covariance)
     separation = separate_noise(own, rows)
     assert torch.allclose(separation.process, usual.process)
+    assert torch.equal(separation.model.observation_noise, own.noise)
+    again = separate_noise(separation.model, rows)
+    assert torch.allclose(again.process, usual.process)
+    assert torch.allclose(again.model.noise, separation.model.noise)
     of_model = separation.model.noise_covariance.diagonal()
     assert torch.allclose(of_model, usual.process)
     # An output that acts on no state keeps its noise.

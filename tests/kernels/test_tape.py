@@ -3,6 +3,7 @@
 import casadi
 import numpy as np
 import pytest
+import torch
 
 from gpmpc._kernels.gp_rollout import Feedback
 from gpmpc.gp.casadi_ import tape_of
@@ -144,3 +145,13 @@ def test_an_infinite_derivative_is_returned_without_an_error():
     assert slopes[0, 0, 0] == np.inf
     assert slopes[1, 1, 1] == -np.inf
     assert slopes[1, 0, 0] == 0.25
+
+
+def test_a_function_without_inputs_is_a_model():
+    x = casadi.SX.sym("x", 2)
+    no_input = casadi.SX.sym("u", 0)
+    function = casadi.Function("f", [x, no_input], [2 * x])
+    model = KnownModel(CasadiFunction(function), 2, input_dim=0)
+    state = torch.ones(3, 2)
+    after = model.predict(state, torch.empty(3, 0)).mean
+    assert torch.equal(after, 2 * state)

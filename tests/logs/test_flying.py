@@ -12,6 +12,7 @@ import torch
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.models import LogDynamics, LogModel, MultirotorNominal, RigidBodyKinematics
+from gpmpc.models._grouped import GroupedNominal
 from gpmpc.models._kinematics import Increments
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import OutputGP
@@ -19,6 +20,8 @@ from gpmpc.models._memory import Memory, Products
 from gpmpc.models._parametric import AffineNominal
 from gpmpc.models._quaternions import rotation_quaternion
 from gpmpc.models._state_space import StateGroup, StateSpace
+from gpmpc.models._system_nominal import SystemNominal
+from gpmpc.systems import pendulum
 from gpmpc.testing import check_model
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
@@ -82,6 +85,48 @@ def test_what_no_controller_can_plan_with_is_named():
     nominal = MultirotorNominal(4, feedback=True)
     with pytest.raises(SettingError, match="feedback of the controller that flew"):
         dynamics(RigidBodyKinematics(BODY), nominal, np.zeros(10), 4, 12)
+
+
+@pytest.mark.parametrize(
+    ("feedback_from", "refused"), [((0, 1, 2), False), ((3, 4, 5), True)]
+)
+def test_feedback_counts_in_the_outputs_that_a_part_gives(feedback_from, refused):
+    others = tuple(sorted(set(range(6)) - set(feedback_from)))
+    nominal = GroupedNominal(
+        parts=(MultirotorNominal(4, feedback=True), MultirotorNominal(4)),
+        outputs_of=(feedback_from, others),
+        sizes=(10, 6),
+    )
+    kinematics = RigidBodyKinematics(BODY)
+    if not refused:
+        dynamics(kinematics, nominal, np.zeros(16), 4, 12)
+        return
+    with pytest.raises(SettingError, match="feedback of the controller that flew"):
+        dynamics(kinematics, nominal, np.zeros(16), 4, 12)
+    # A GP alone says what these outputs are.
+    dynamics(kinematics, nominal, np.zeros(16), 4, 12, without_nominal=(3, 4))
+
+
+def without_gps(nominal, space):
+    kinematics = Increments(space)
+    return LogDynamics(LogModel(kinematics, nominal, np.empty(0), (0, 0)), 1, 0.05)
+
+
+def test_parts_that_all_stand_still_are_named_and_a_known_system_moves():
+    space = StateSpace((StateGroup("x", ("angle", "rate"), ""),))
+    still = AffineNominal(Increments(space), fitted=False)
+    parts = GroupedNominal((still, still), ((0,), (1,)), (0, 0))
+    with pytest.raises(SettingError, match="whatever the inputs are"):
+        without_gps(parts, space)
+    known = SystemNominal(
+        factory=pendulum,
+        code="gpmpc.systems:pendulum",
+        fitted=(),
+        time_step=0.05,
+        state_names=("angle", "rate"),
+        input_names=("torque",),
+    )
+    assert without_gps(known, space).state_dim == 2
 
 
 def test_a_model_with_a_past_has_it_in_its_state():

@@ -1,14 +1,30 @@
 """Delayed models and disturbance states obey the protocol, and look ahead exactly."""
 
+from dataclasses import replace
+
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
+from gpmpc.calibration import Recording, calibrate
+from gpmpc.estimation import KalmanFilter, Measurement
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.models import DelayedModel, DisturbedModel, load_model, save_model
+from gpmpc.models import (
+    DelayedModel,
+    DisturbedModel,
+    NoisyModel,
+    load_model,
+    save_model,
+)
+from gpmpc.models._past import has_past, states_along
+from gpmpc.mpc import beyond_data
 from gpmpc.propagation import Linearization, MonteCarlo
+from gpmpc.signals import Signals
+from gpmpc.simulation import ModelLoop
+from gpmpc.simulation._simulator import ModelSimulator
 from gpmpc.testing import check_model
 
 F = torch.float64
@@ -161,3 +177,73 @@ def test_models_are_saved_and_loaded_whole(model, tmp_path):
 def test_misuse_is_refused(make, error, rule):
     with pytest.raises(error, match=rule):
         make()
+
+
+NAMED = replace(gp(), signals=Signals(["angle", "rate"], ["torque"], 0.1))
+
+
+def test_what_is_measured_of_a_delayed_model_has_the_names_of_its_model():
+    delayed = DelayedModel(NAMED, 1)
+    assert delayed.signals.state_names == ("angle", "rate", "torque[k-1]")
+    states = 0.1 * draw(5, 9, 2)
+    inputs = draw(6, 8, 1)
+    for signals in (NAMED.signals, Signals()):
+        flight = Recording(states, inputs, signals)
+        assert calibrate(delayed, flight, horizon=2).names == ("angle", "rate")
+    swapped = pd.Series({"rate": 9.0, "angle": 0.1})
+    (beyond,) = beyond_data(delayed, swapped)
+    assert beyond.name == "rate"
+    loop = ModelLoop(delayed, Linearization(), 0.1)
+    assert ModelSimulator(loop, swapped).mean.tolist() == [0.1, 9.0]
+    named = Gaussian(torch.tensor([9.0, 0.1]), torch.diag(torch.tensor([4.0, 1.0])))
+    belief = replace(named, names=("rate", "angle"))
+    assert ModelSimulator(loop, belief).covariance.diagonal().tolist() == [1.0, 4.0]
+
+
+@pytest.mark.parametrize(("delay", "steps"), [(0.3 / 0.1, 3), ((0.1 + 0.2) / 0.1, 3)])
+def test_whole_steps_that_come_from_a_division_are_whole(delay, steps):
+    assert delay != steps
+    model = DelayedModel(gp(), delay)
+    assert (model.pending, model.lead) == (steps, steps)
+    assert model.remaining is model.model
+
+
+def test_a_noisy_model_has_the_past_of_its_model():
+    delayed = DelayedModel(NAMED, 2)
+    ones = torch.ones(1, dtype=F)
+    scales = torch.ones(1, 5, dtype=F)
+    g = GPPosterior.from_hyperparameters(
+        draw(1, 9, 5), draw(2, 9, 1), scales, ones, 0.1 * ones, 1, "value"
+    )
+    noisy = NoisyModel(delayed, g, [1])
+    assert has_past(noisy)
+    assert not has_past(noisy.log_noise)
+    assert (noisy.measured_dim, noisy.past) == (2, delayed.past)
+    whole = [
+        states_along(model, np.ones((4, 2)), np.arange(3.0)[:, None])
+        for model in (noisy, delayed)
+    ]
+    np.testing.assert_array_equal(*whole)
+
+
+def test_a_model_around_one_that_names_what_is_measured_adds_no_names():
+    class Remembering:  # its state goes on with what has no name
+        state_dim = output_dim = 3
+        measured_dim = 2
+        input_dim = 1
+        signals = Signals(["x", "v"])
+        dtype = F
+        device = torch.device("cpu")
+        noise_covariance = 0.01 * torch.eye(3).double()
+
+        def predict(self, state, input):
+            return Gaussian(state, torch.zeros(*state.shape, 3, dtype=F))
+
+    inner = Remembering()
+    disturbed = DisturbedModel(inner, torch.eye(3, 1, dtype=F), [0.1])
+    assert disturbed.signals.state_names == ("x", "v")
+    for model, state in ((disturbed, 2), (disturbed, 3), (inner, 2)):
+        sensor = Measurement.of_states(model.state_dim, [0, state], [0.1, 0.1])
+        belief = Gaussian.certain(torch.zeros(model.state_dim))
+        update = KalmanFilter(model, sensor).update(belief, [0.1, 0.2])
+        assert update.innovation.tolist() == [0.1, 0.2]

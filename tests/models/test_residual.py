@@ -1,13 +1,16 @@
 """Residual models against sampling, finite differences and known residuals."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from gpmpc._dynamics import predict_with_jacobian
+from gpmpc.estimation import Measurement
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, SlidingWindow, SparseTrainer, Trainer, Transitions
-from gpmpc.models import Affine, ResidualModel
+from gpmpc.models import Affine, DelayedModel, KnownModel, ResidualModel
 from gpmpc.propagation import (
     Linearization,
     MeanEquivalence,
@@ -280,3 +283,36 @@ def test_misuse_is_refused_with_the_rule(change, error, message):
     }
     with pytest.raises(error, match=message):
         ResidualModel(**(good | change))
+
+
+def double_sided(dtype):
+    return Affine(
+        torch.eye(3, dtype=dtype), torch.zeros(3, 2, dtype=dtype), torch.zeros(3)
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"B": torch.eye(3).float()}, "B: must be torch.float64 on cpu like the tr"),
+        ({"nominal": double_sided(torch.float32)}, "nominal.A: must be torch.float64"),
+        (
+            {"B": lambda x: torch.ones(*x.shape, 1, dtype=torch.float32)},
+            "B: must be torch.float64 on cpu like the states; got torch.float32",
+        ),
+    ],
+)
+def test_tensors_of_another_type_are_refused_before_the_training(change, message):
+    good = {"nominal": double_sided(torch.float64)}
+    with pytest.raises(SettingError, match=message):
+        ResidualModel.train(transitions=transitions(12), **(good | change))
+
+
+def test_models_are_equal_to_themselves_alone():
+    one = model()
+    noisy = DelayedModel(one, 1)
+    sensor = Measurement.of_states(3, [0], [0.1])
+    for part in (one, noisy, AFFINE, sensor, KnownModel(AFFINE, 3, 2)):
+        assert part in [replace(part), part]
+        assert part != replace(part)
+        assert len({part, replace(part)}) == 2

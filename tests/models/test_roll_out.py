@@ -162,3 +162,32 @@ def test_arrays_of_other_sizes_are_refused(kind):
     ):
         with pytest.raises(ShapeError, match=r"start \(T, n\), inputs|\(T, H, m\)"):
             roll_out.open_loop(*mistake)
+
+
+@pytest.mark.parametrize(
+    ("part", "shape"),
+    [
+        ("states", (2, 3, 3)),
+        ("states", (1, 4, 3)),
+        ("gains", (1, 3, 2, 3)),
+        ("lower", (2,)),
+        ("rate_upper", (3, 2)),
+        ("previous_input", (1,)),
+    ],
+)
+def test_a_feedback_of_other_shapes_is_refused(part, shape):
+    free = np.full((4, 2), np.inf)
+    feedback = Feedback(
+        states=np.zeros((2, 5, 3)),
+        inputs=np.zeros((2, 4, 2)),
+        gains=np.zeros((1, 4, 2, 3)),
+        lower=-free,
+        upper=free,
+        rate_lower=-free,
+        rate_upper=free,
+        previous_input=np.zeros(2),
+    )
+    roll_out = RollOut(MODELS["differences"]())
+    roll_out(np.zeros((2, 3)), feedback)
+    with pytest.raises(ShapeError, match="must be of 2 plans of 4 stages, 3 states"):
+        roll_out(np.zeros((2, 3)), feedback._replace(**{part: np.zeros(shape)}))

@@ -2,6 +2,7 @@
 
 import logging
 
+import casadi
 import numpy as np
 import pytest
 import torch
@@ -12,10 +13,22 @@ from gpmpc.estimation import (
     AdaptiveTube,
     ConformalTube,
     estimate_process_noise,
+    estimate_varying_noise,
 )
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import SlidingWindow, SparseTrainer, Trainer, Transitions
-from gpmpc.models import Affine, DelayedModel, DisturbedModel, Lags, ResidualModel
+from gpmpc.models import (
+    Affine,
+    CasadiFunction,
+    DelayedModel,
+    DisturbedModel,
+    Features,
+    KnownModel,
+    Lags,
+    ResidualModel,
+    RollOut,
+)
+from gpmpc.models._kinematic_rates import kinematic_residual
 from gpmpc.models._residual import train_residual
 from gpmpc.propagation import Linearization, MonteCarlo, Unscented
 
@@ -117,7 +130,38 @@ def wrapping_pendulum(x, u):
     return torch.stack([torch.atan2(angle.sin(), angle.cos()), rate], dim=-1)
 
 
-@pytest.mark.parametrize("nominal", [None, wrapping_pendulum], ids=["none", "wraps"])
+def wrapping_in_casadi():
+    """The same, as a user's function in CasADi."""
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u")
+    rate = x[1] + STEP * (9.81 * casadi.sin(x[0]) + u)
+    angle = x[0] + STEP * rate
+    wrapped = casadi.atan2(casadi.sin(angle), casadi.cos(angle))
+    return casadi.Function("f", [x, u], [casadi.vertcat(wrapped, rate)])
+
+
+class Linearizing:
+    """A nominal model of the own, with its own derivatives."""
+
+    def __init__(self):
+        self.inner = CasadiFunction(wrapping_in_casadi())
+
+    def __call__(self, state, input):
+        return self.inner(state, input)
+
+    def linearize(self, states, inputs):
+        return self.inner.linearize(states, inputs)
+
+
+NOMINAL = {
+    "none": None,
+    "torch": wrapping_pendulum,
+    "casadi": CasadiFunction(wrapping_in_casadi()),
+    "own derivatives": Linearizing(),
+}
+
+
+@pytest.mark.parametrize("nominal", NOMINAL.values(), ids=NOMINAL)
 def test_predictions_do_not_jump_at_half_a_turn(nominal):
     model = learned(transitions("hanging"), nominal)
     angles = torch.linspace(np.pi - 0.3, np.pi + 0.3, 61, dtype=F)
@@ -127,6 +171,8 @@ def test_predictions_do_not_jump_at_half_a_turn(nominal):
     assert (mean.diff(dim=0)[:, 0] - 0.01).abs().max() < 0.002
     assert np.allclose(model.linearize(x.numpy(), u.numpy()).mean, mean)
     assert np.allclose(model.predict_mean(x.numpy(), u.numpy()), mean)
+    rolled_out = RollOut(model).open_loop(x.numpy(), u.numpy()[:, None])
+    assert np.allclose(rolled_out[:, 1], mean)
     turned = torch.tensor([6 * np.pi, 0.0], dtype=F)
     assert torch.allclose(model.predict(x + turned, u).mean - turned, mean, atol=1e-9)
     for propagator in (Linearization(), Unscented(), MonteCarlo(200)):
@@ -134,6 +180,73 @@ def test_predictions_do_not_jump_at_half_a_turn(nominal):
         next_belief = propagator(model, belief, u)
         assert (next_belief.mean - mean).abs().max() < 0.05
         assert next_belief.variance[:, 0].max() < 0.02
+
+
+def test_a_function_that_counts_turns_stays_itself():
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u")
+    counting = CasadiFunction(
+        casadi.Function("f", [x, u], [casadi.vertcat(x[0] + STEP * x[1], x[1] + u)])
+    )
+    assert counting.counting_turns((0,)) is counting
+    wrapping = CasadiFunction(wrapping_in_casadi())
+    assert wrapping.counting_turns(()) is wrapping
+    assert wrapping.counting_turns((1,)) is wrapping
+    assert wrapping.counting_turns((0,)) is wrapping.counting_turns((0,))
+
+
+def test_a_position_may_turn_by_half_a_turn_in_a_step():
+    rng = np.random.default_rng(0)
+    h = 0.1
+    states = np.column_stack([rng.uniform(-3, 3, 60), rng.uniform(25.0, 45.0, 60)])
+    inputs = rng.uniform(-1, 1, (60, 1))
+    rate = states[:, 1] + inputs[:, 0]
+    after = np.column_stack([states[:, 0] + h * rate, rate])  # half a turn and more
+    tensors = [torch.from_numpy(rows) for rows in (states, inputs, shown(after))]
+    kinematic = kinematic_residual(
+        rates={1: 0},
+        features=Features([0, 1], [0], [0], state_dim=2, input_dim=1),
+        nominal=None,
+        states=tensors[0],
+        inputs=tensors[1],
+        next_states=tensors[2],
+        time_step=h,
+    )
+    assert float(kinematic.noise[0]) < 1e-12
+    assert kinematic.B.ravel().tolist() == pytest.approx([h, 1.0])
+
+
+def test_a_noise_that_varies_is_the_same_a_turn_on():
+    rng = np.random.default_rng(0)
+    angles = rng.normal(np.pi, 0.4, 150)  # hanging: the seam of a sensor in its middle
+    states = shown(np.column_stack([angles, rng.normal(0.0, 1.0, 150)]))
+    deviations = 0.02 + 0.3 * np.abs(angles - np.pi)
+    after = states.copy()
+    after[:, 1] += deviations * rng.normal(size=150)
+    rows = Transitions(states, np.zeros((150, 1)), after)
+    known = AngleOf(Affine.identity(2, 1), 2, 1)
+    varying = estimate_varying_noise(known, rows, block=5)
+    assert varying.outputs == (1,)
+    x = torch.tensor([[np.pi - 0.5, 0.0], [np.pi + 0.5, 0.0], [3.2, 0.0]], dtype=F)
+    u = torch.zeros(3, 1, dtype=F)
+    noise = varying.model.noise(x, u)
+    assert (
+        noise[:, 1, 1].sqrt() / torch.tensor([0.17, 0.17, 0.04])
+    ).log().abs().max() < 1
+    for turns in (-1, 1, 3):
+        turned = x + torch.tensor([2 * np.pi * turns, 0.0], dtype=F)
+        assert torch.allclose(varying.model.noise(turned, u), noise, rtol=1e-6)
+        V = varying.model.linearize(turned.numpy(), u.numpy()).covariance
+        assert np.allclose(V, noise, rtol=1e-6)
+    # The noise of a noisy model is learned anew, not on top of itself.
+    again = estimate_varying_noise(varying.model, rows, block=5)
+    assert again.model.model is known
+
+
+class AngleOf(KnownModel):
+    """A known model whose first state is an angle."""
+
+    angles = (0,)
 
 
 class Wrapping:
