@@ -77,7 +77,11 @@ class DynamicsModel(Protocol):
 
     @property
     def noise_covariance(self) -> Tensor:
-        """Covariance of the observations' noise (k, k); not part of ``predict``."""
+        """Covariance (k, k) of what scatters the data around the prediction.
+
+        It is not part of ``predict``: propagators add it to every step as process
+        noise.
+        """
         ...
 
     def predict(self, state: Tensor, input: Tensor) -> Gaussian:
@@ -103,9 +107,12 @@ class DynamicsModel(Protocol):
 
 
 class TensorModel:
-    """A model with the type and the device of its attribute ``_part``."""
+    """A model whose type and device are those of a part of it.
 
-    _part: Any
+    A subclass says which: ``_part = property(lambda self: self.residual)``.
+    """
+
+    _part: Any  #: a tensor, or a model
 
     @property
     def dtype(self) -> torch.dtype:

@@ -39,6 +39,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from scipy.stats import beta
+from torch import Tensor
 
 from gpmpc._angles import angles_of, full_turns, state_difference
 from gpmpc._arrays import read_array
@@ -53,6 +54,13 @@ from gpmpc.exceptions import (
     check_number,
 )
 from gpmpc.gaussian import Gaussian
+from gpmpc.models._past import (
+    first_signals,
+    has_past,
+    measured_dim,
+    rows_before,
+    states_along,
+)
 from gpmpc.propagation import Propagator, rollout
 from gpmpc.signals import signals_of
 
@@ -97,7 +105,8 @@ class ConformalTube:
         Args:
             model: Was not trained on this log.
             propagator: As the controller has it, with the process noise.
-            states: x_0 .. x_T at equal time steps (T + 1, n).
+            states: x_0 .. x_T at equal time steps (T + 1, n); of a model with a past,
+                such as a ``DelayedModel``, what is measured of them.
             inputs: u_0 .. u_{T-1} (T, m) or one more.
             horizon: H.
             rows: Directions g (r, n); both sides of every state by default. A bound on
@@ -112,7 +121,8 @@ class ConformalTube:
                 table has other columns than the model's names.
         """
         check_number("horizon", horizon, least=1, whole=True)
-        names = signals_of(model)
+        columns = np.shape(states)[-1] if np.ndim(states) else 0
+        names = first_signals(signals_of(model), columns)
         states = read_array("states", states, names.state_names)
         inputs = read_array("inputs", inputs, names.input_names)
         x = torch.as_tensor(states, dtype=model.dtype, device=model.device)
@@ -122,7 +132,8 @@ class ConformalTube:
             raise ShapeError(
                 f"states (T + 1, n) and inputs (T, m) must be one log; got {got}"
             )
-        begins = np.arange(0, len(x) - horizon, horizon)
+        whole, first = _with_past(model, x, u)
+        begins = np.arange(first, len(x) - horizon, horizon)
         steps = begins[:, None] + np.arange(1, horizon + 1)  # (windows, H)
         n = x.shape[1]
         if not len(steps):
@@ -133,16 +144,17 @@ class ConformalTube:
         G = both_sides if rows is None else _as_rows(rows)
         if G.shape[1] != n:
             raise ShapeError(f"rows must be (r, {n}); got {G.shape}")
-        starts = Gaussian.certain(x[begins])
+        starts = Gaussian.certain(whole[begins])
         predicted = rollout(propagator, model, starts, u[steps - 1])
-        covariance = to_array(predicted.covariance)
+        covariance = to_array(predicted.covariance)[..., :n, :n]
         deviation = np.sqrt(np.einsum("ri,khij,rj->khr", G, covariance, G))
         if not (deviation > 0).all():
             raise DataError(
                 "a direction has no variance: predict with the process noise"
             )
         turning = angles_of(model) if angles is None else list(angles)
-        errors = to_array(state_difference(x[steps], predicted.mean, turning))
+        mean = predicted.mean[..., :n]
+        errors = to_array(state_difference(x[steps], mean, turning))
         scores = (errors @ G.T / deviation).max(-1)
         if not np.isfinite(scores).all():
             raise DataError("a score is not finite: a prediction or a state is not")
@@ -170,6 +182,18 @@ class ConformalTube:
                 f"got {len(self.scores)}"
             )
         return self.scores[rank - 1].copy()
+
+
+def _with_past(model: DynamicsModel, x: Tensor, u: Tensor) -> tuple[Tensor, int]:
+    """Completes measured states (T + 1, n) of a model with a past.
+
+    Returns:
+        The whole states, and the row from which on they are known.
+    """
+    if not has_past(model) or x.shape[1] != measured_dim(model):
+        return x, 0
+    whole = states_along(model, to_array(x), to_array(u))
+    return torch.from_numpy(whole).to(x), rows_before(model)
 
 
 @explains_arguments

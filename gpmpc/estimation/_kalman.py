@@ -319,7 +319,7 @@ class KalmanFilter:
         # A missing entry shows nothing, with a noise that is independent of others.
         unrelated = missing[..., None] | missing[..., None, :]
         eye = torch.eye(len(R)).to(R)
-        noise = torch.where(unrelated, eye, view.linearization_error + R)
+        noise = torch.where(unrelated, eye, view.unexplained + R)
         H_root = torch.where(missing[..., None], 0.0, view.H_root)
         posterior = condition(view.root, H_root, noise)
         correction = posterior.gain @ torch.where(missing, 0.0, innovation)[..., None]
@@ -360,7 +360,7 @@ class KalmanFilter:
                 H_root=H_root,
                 mean=value.mean,
                 covariance=squared(H_root) + value.covariance,
-                linearization_error=value.covariance,
+                unexplained=value.covariance,
             )
         propagated = self.observer.propagate(self.measurement, belief)
         covariance = propagated.belief.covariance
@@ -370,7 +370,7 @@ class KalmanFilter:
             H_root=H_root,
             mean=propagated.belief.mean,
             covariance=covariance,
-            linearization_error=unexplained_covariance(covariance, H_root),
+            unexplained=unexplained_covariance(covariance, H_root),
         )
 
     def run(self, belief: Gaussian, inputs: Any, measured: Any) -> FilterRun:
@@ -420,7 +420,8 @@ class _View(NamedTuple):
     H_root: Tensor  # Y = H L of Cov[x, y] = L Y' (*batch, p, n)
     mean: Tensor  # E[y] (*batch, p)
     covariance: Tensor  # Cov[y] (*batch, p, p)
-    linearization_error: Tensor  # Cov[y] - Y Y' (*batch, p, p)
+    # Cov[y] - Y Y', which H L does not explain (*batch, p, p); none at first order
+    unexplained: Tensor
 
 
 @explains_arguments

@@ -200,7 +200,10 @@ class GPPosterior(TensorModel):
 
     @property
     def noise_covariance(self) -> Tensor:
-        """Covariance of the observations (k, k), diagonal."""
+        """Covariance (k, k) of what scatters the data around the prediction, diagonal.
+
+        Propagators add it to every step as process noise.
+        """
         return torch.diag(self.noise_variance)
 
     @cached_property

@@ -67,8 +67,9 @@ class Training:
         ``Trainer`` and ``SparseTrainer``, which return it.
     """
 
-    #: the trained GPs, frozen; of a sparse training, to M pseudo-observations at the
-    #: inducing points
+    #: the model: the trained GPs, frozen, or a ``ResidualModel`` with them where a
+    #: system's structure is known; of a sparse training, GPs of M pseudo-observations
+    #: at the inducing points
     posterior: GPPosterior
     #: rows (log l, log sf, log(sf / sn)), one an output (k, d + 2), in the units of the
     #: data

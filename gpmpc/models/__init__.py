@@ -12,6 +12,11 @@ as accelerations, which kinematics turn into a movement; ``LogDynamics`` makes a
 them are linear but for the model inside: a delay, disturbances as states; or they add
 noise.
 
+Nominal models are of three kinds: of a ``ResidualModel`` a function of tensors, from
+state and input to next state (``_nominal``); of a ``LogModel`` a ``ParametricNominal``,
+from parameters and arrays to outputs; and ``System.nominal`` is a ``System``, of which
+``train`` makes the first kind.
+
 A new structure has one of these places:
 
 - a nominal model with parameters that are fitted, such as those of a ``System``: a

@@ -9,14 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc._arrays import read_array
+from gpmpc._arrays import names_of, read_array
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, DynamicsModel, check_next_states
 from gpmpc.exceptions import ShapeError, check_number
 from gpmpc.gaussian import Gaussian
+from gpmpc.gp import Transitions
 from gpmpc.models._past import has_past, measured_dim, rows_before
 from gpmpc.models._wrapper import LinearPart, LinearWrapper
-from gpmpc.signals import signals_of
+from gpmpc.signals import Signals, signals_of
 
 _DIGITS = 9  # of a delay in steps, behind the point
 
@@ -34,7 +35,9 @@ class DelayedModel(LinearWrapper):
 
         x[k+1] = f(x[k], w u_{k-D} + (1 - w) u_{k-D+1}),
 
-    and the other inputs move on by a place. A controller plans with it, or, with fewer
+    and the other inputs move on by a place. The model inside is trained on the inputs
+    that acted (``transitions``): one of rows as they were recorded would be late twice.
+    A controller plans with it, or, with fewer
     states, with the undelayed model from the state to which the pending inputs will
     have led (``ahead``; the prediction of Smith, 1957, in state space).
 
@@ -50,11 +53,38 @@ class DelayedModel(LinearWrapper):
     delay: float  #: in steps, more than zero; a fraction is allowed
 
     def __post_init__(self) -> None:
-        check_number("delay", self.delay, unit="[steps]")
-        # 0.3 / 0.1 is less than 3, by round-off.
-        object.__setattr__(self, "delay", round(self.delay, _DIGITS))
-        check_number("delay", self.delay, above=0, unit="[steps]")
+        object.__setattr__(self, "delay", _whole_or_fraction(self.delay))
         check_next_states(self.model)
+
+    @staticmethod
+    def transitions(states: Any, inputs: Any, delay: float) -> Transitions:
+        """Returns rows to train the model inside on, with the inputs that acted.
+
+        The first D rows are left out: what acted there was applied before the log.
+
+        Args:
+            states: x_0 .. x_T of one log at equal time steps (T + 1, n).
+            inputs: u_0 .. u_{T-1}, as they were applied (T, m), or one more.
+            delay: In steps; see ``gpmpc.estimation.estimate_delay``.
+
+        Raises:
+            SettingError: The delay is no positive number.
+            ShapeError: States and inputs are no rows of one log, longer than the delay.
+        """
+        delay = _whole_or_fraction(delay)
+        signals = Signals(names_of(states), names_of(inputs))
+        x = read_array("states", states)
+        u = read_array("inputs", inputs)
+        pending = math.ceil(delay)
+        T = len(x) - 1
+        if x.ndim != 2 or u.ndim != 2 or len(u) not in (T, T + 1) or pending >= T:
+            rule = f"states (T + 1, n) and inputs (T, m) need T above {pending}"
+            raise ShapeError(f"{rule}; got {x.shape} and {u.shape}")
+        w = delay - (pending - 1)
+        older = u[: T - pending]
+        newer = u[1 : T - pending + 1]
+        acting = w * older + (1 - w) * newer
+        return Transitions(x[pending:-1], acting, x[pending + 1 :], signals)
 
     @property
     def pending(self) -> int:
@@ -119,7 +149,7 @@ class DelayedModel(LinearWrapper):
 
     @property
     def noise_covariance(self) -> Tensor:
-        """Covariance of the observations' noise; pending inputs have none."""
+        """Covariance of the model's noise; pending inputs have none."""
         return self._padded(self.model.noise_covariance)
 
     @cached_property
@@ -215,3 +245,15 @@ class DelayedModel(LinearWrapper):
             )
             raise ShapeError(f"{rule}; got {tuple(pending.shape)}")
         return pending
+
+
+def _whole_or_fraction(delay: float) -> float:
+    """Returns a delay [steps] without round-off: 0.3 / 0.1 is less than 3.
+
+    Raises:
+        SettingError: It is no positive number.
+    """
+    check_number("delay", delay, unit="[steps]")
+    rounded = round(delay, _DIGITS)
+    check_number("delay", rounded, above=0, unit="[steps]")
+    return rounded

@@ -79,7 +79,7 @@ class DisturbedModel(LinearWrapper):
 
     @property
     def noise_covariance(self) -> Tensor:
-        """Covariance of the observations' noise, and of the disturbances' changes."""
+        """Covariance of the model's noise, and of the disturbances' changes."""
         changes = self._diagonal_covariance(self.std)
         return torch.block_diag(self.model.noise_covariance, changes)
 

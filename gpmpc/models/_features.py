@@ -1,6 +1,19 @@
 """Features: what a GP sees of a state and an input.
 
-They are selected columns, with angles as sine and cosine.
+They are selected columns, with angles as sine and cosine. ``Features`` computes them
+for torch, arrays and derivatives. What a feature is stands elsewhere too; another kind
+of feature is a change of each:
+
+    models/_residual_data._feature_names  their names        tests/models/test_training
+    models/_training._prior_lengthscales  their scales       tests/models/test_training
+    models/_roll_out._compiled_form       compiled           tests/models/test_roll_out
+    _kernels/gp_rollout (SINE, COSINE)    compiled           tests/models/test_roll_out
+    gp/_posterior.AffineForm              for moments        tests/propagation
+    gp/casadi_._predict_residual_model    CasADi             tests/gp/test_casadi
+    mpc/_data_range._columns_of           ranges of data     tests/mpc/test_data_range
+    mpc/_novelty._ranges                  ranges of data     tests/mpc/test_novelty
+    export/_models                        C                  tests/export
+    models/_residual.ResidualModel        a field, in files  tests/models/test_residual
 """
 
 from collections.abc import Sequence
@@ -116,8 +129,9 @@ class Features:
             inputs: (K, m).
 
         Returns:
-            The features (K, d), the selected inputs (K, m_s), and the derivative of
-            each feature by its state (K, d); None where all of these are one.
+            The features (K, d), the selected inputs (K, m_s), and slopes (K, d): of
+            each feature one number, its derivative by the one state that it is a
+            function of (``columns``). None where all of these are one.
         """
         features = states[:, self.columns].astype(float)
         selected_inputs = inputs[:, self._input_columns]

@@ -49,9 +49,9 @@ from gpmpc.models._residual_data import (
     Nominal,
     check_derivatives,
     counts_turns,
+    describe_columns,
     effect_matrix,
     nominal_next_state,
-    residual_columns,
     residual_data,
 )
 from gpmpc.models._tensors import check_like, move
@@ -95,8 +95,9 @@ class ResidualModel(TensorModel):
     #: those of ``states`` that are angles [rad]: d sees them as (sine, cosine), at
     #: their place, and their differences are taken within half a turn
     angles: Sequence[int] = ()
-    #: covariance of the observations (n, n); by default that of d's, B diag(sn2) B',
-    #: which needs a constant B
+    #: covariance of what scatters the data around the prediction (n, n), which
+    #: propagators add to every step; by default that of d's, B diag(sn2) B', which
+    #: needs a constant B
     noise: Tensor | None = None
     signals: Signals = UNKNOWN  #: names and time step of the data, where they are known
     #: all noise of the observations (n, n), where ``noise`` is the process' part alone
@@ -249,7 +250,10 @@ class ResidualModel(TensorModel):
 
     @property
     def state_dim(self) -> int:
-        """Number of states, n."""
+        """Number of states, n: rows of B, or of the noise where B is a function.
+
+        Zero where neither is a tensor: ``_check_tensors`` says what is wrong.
+        """
         square = self.noise if callable(self.B) else self.B
         if isinstance(square, Tensor) and square.dim():
             return len(square)
@@ -262,7 +266,10 @@ class ResidualModel(TensorModel):
 
     @property
     def noise_covariance(self) -> Tensor:
-        """Covariance of the observations' noise (n, n)."""
+        """Covariance (n, n) of what scatters the data around the prediction.
+
+        Propagators add it to every step as process noise.
+        """
         if self.noise is None and not callable(self.B):
             return self.B @ self.residual.noise_covariance @ self.B.mT
         return torch.as_tensor(self.noise)
@@ -318,15 +325,19 @@ class ResidualModel(TensorModel):
         d = self.residual.linearize(features, selected_inputs, covariance)
         by_state, by_input = self.features.chain(d.A, d.B, slopes)
         if callable(self.B):
-            B, dB = self._linearize_effect(states)
-            A = A + (dB * d.mean[:, None, :, None]).sum(2)
+            effect, slopes_of_effect = self._linearize_effect(states)
+            A = A + (slopes_of_effect * d.mean[:, None, :, None]).sum(2)
         else:
-            B = self._constant_effect
+            effect = self._constant_effect
         V = None
         if d.covariance is not None:
-            V = B @ d.covariance @ B.swapaxes(-1, -2)
-        mean = f0 + (B @ d.mean[..., None])[..., 0]
-        return Linearized(mean, A + B @ by_state, G + B @ by_input, V)
+            V = effect @ d.covariance @ effect.swapaxes(-1, -2)
+        return Linearized(
+            mean=f0 + (effect @ d.mean[..., None])[..., 0],
+            A=A + effect @ by_state,
+            B=G + effect @ by_input,
+            covariance=V,
+        )
 
     def _linearize_nominal(self, states: Array, inputs: Array) -> tuple[Array, ...]:
         """Computes f0 (K, n), and its derivatives by state and input.
@@ -388,7 +399,7 @@ def train_residual(
     states: Sequence[int] | None = None,
     inputs: Sequence[int] | None = None,
 ) -> Training:
-    """Trains a residual model, and returns the whole training.
+    """Trains a residual model, and returns the whole training: it is its ``posterior``.
 
     Arguments and errors are those of ``ResidualModel.train``. Without a nominal model
     the difference of two states is learned.
@@ -427,7 +438,7 @@ def train_residual(
         len(features.inputs),
         "value",
         seed,
-        columns=residual_columns(transitions, B, features),
+        columns=describe_columns(transitions, B, features),
     )
     model = ResidualModel(
         nominal=nominal,

@@ -127,14 +127,16 @@ def residual_data(
     # torch.linalg.lstsq gives other last digits from call to call.
     Q, R = torch.linalg.qr(effect)
     if callable(B):
-        columns = torch.linalg.solve_triangular(R, Q.mT @ error[..., None], upper=True)
-        targets = columns[..., 0]
+        solutions = torch.linalg.solve_triangular(
+            R, Q.mT @ error[..., None], upper=True
+        )
+        targets = solutions[..., 0]
     else:
         targets = torch.linalg.solve_triangular(R, Q.mT @ error.mT, upper=True).mT
     return ResidualData(torch.cat(features(states, inputs), dim=1), targets)
 
 
-def residual_columns(
+def describe_columns(
     transitions: Transitions, B: Effect, features: Features
 ) -> Columns:
     """Describes features and targets of a residual: their names and magnitudes.

@@ -26,7 +26,7 @@ from gpmpc.models._residual import ResidualModel, train_residual
 from gpmpc.models._residual_data import Nominal
 from gpmpc.systems import System
 
-Kinematics = Literal["integrated", "learned"]
+KinematicsChoice = Literal["integrated", "learned"]
 KINEMATICS = ("integrated", "learned")
 
 
@@ -36,7 +36,7 @@ def train(
     system: System | None = None,
     *,
     trainer: Callable[..., Training] | None = None,
-    kinematics: Kinematics = "integrated",
+    kinematics: KinematicsChoice = "integrated",
     seed: int = 0,
     **settings: Any,
 ) -> Training:
@@ -124,7 +124,7 @@ def _train_on_system(
     transitions: Transitions,
     system: System,
     trainer: Any,
-    kinematics: Kinematics,
+    kinematics: KinematicsChoice,
     seed: int,
 ) -> Training:
     """Trains on transitions of a system; see ``train``."""

@@ -21,7 +21,7 @@ from gpmpc.exceptions import (
 from gpmpc.gp import Training, Transitions
 from gpmpc.learning import EpisodicLearning, OnlineLearning
 from gpmpc.models import train
-from gpmpc.models._training import KINEMATICS, Kinematics
+from gpmpc.models._training import KINEMATICS, KinematicsChoice
 from gpmpc.mpc._policy import OnFailure, check_policy
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Propagator
@@ -88,7 +88,7 @@ class Experiment:
     #: trained before; None trains one where the controller needs it
     model: DynamicsModel | None = None
     #: whether states that have rates are integrated from these, or learned too
-    kinematics: Kinematics = "integrated"
+    kinematics: KinematicsChoice = "integrated"
 
     def __post_init__(self) -> None:
         check_kind("system", self.system, System, "a System")

@@ -8,13 +8,15 @@ import pytest
 import torch
 
 from gpmpc.calibration import Recording, calibrate
-from gpmpc.estimation import KalmanFilter, Measurement
+from gpmpc.estimation import ConformalTube, KalmanFilter, Measurement
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 from gpmpc.models import (
+    Affine,
     DelayedModel,
     DisturbedModel,
+    KnownModel,
     NoisyModel,
     load_model,
     save_model,
@@ -247,3 +249,38 @@ def test_a_model_around_one_that_names_what_is_measured_adds_no_names():
         belief = Gaussian.certain(torch.zeros(model.state_dim))
         update = KalmanFilter(model, sensor).update(belief, [0.1, 0.2])
         assert update.innovation.tolist() == [0.1, 0.2]
+
+
+@pytest.mark.parametrize("delay", [1, 2, 0.4, 2.3])
+def test_a_model_inside_is_trained_on_the_inputs_that_acted(delay):
+    plant = Affine(torch.tensor([[0.9]]), torch.tensor([[0.5]]), torch.zeros(1))
+    known = KnownModel(plant, 1, 1)
+    delayed = DelayedModel(known, delay)
+    inputs = draw(4, 12, 1)
+    z = torch.zeros(delayed.state_dim)
+    states = [z[:1]]
+    for u in inputs:
+        z = delayed.predict(z, u).mean
+        states.append(z[:1])
+    rows = DelayedModel.transitions(torch.stack(states), inputs, delay)
+    assert len(rows) == 12 - delayed.pending
+    predicted = known.predict(rows.states, rows.inputs).mean
+    assert torch.allclose(predicted, rows.next_states, atol=1e-14)
+    table = pd.DataFrame({"x": torch.stack(states)[:, 0]})
+    assert DelayedModel.transitions(table, inputs, delay).signals.state_names == ("x",)
+    with pytest.raises(ShapeError, match="need T above"):
+        DelayedModel.transitions(table[:2], inputs[:1], delay)
+
+
+def test_a_tube_of_a_delayed_model_is_calibrated_on_what_is_measured():
+    delayed = DelayedModel(NAMED, 1)
+    states = 0.1 * draw(5, 41, 2)
+    inputs = draw(6, 40, 1)
+    table = pd.DataFrame(states.numpy(), columns=["angle", "rate"])
+    tube = ConformalTube.calibrate(delayed, Linearization(), table, inputs, 3)
+    assert tube.rows.shape == (4, 2)
+    # The same as of the model inside with the inputs that acted.
+    inner = ConformalTube.calibrate(
+        NAMED, Linearization(), states[1:], inputs[:-1], horizon=3
+    )
+    np.testing.assert_allclose(tube.scores, inner.scores, rtol=1e-9)
