@@ -31,8 +31,8 @@ class Lags:
     >>> lags = Lags(state_dim=2, input_dim=1, states=2, inputs=1)
 
     See Also:
-        ``DelayedModel``, of which inputs are late; ``LogModel.time_constants``, of
-        which actuators are slow; ``gpmpc.logs.learn``, which chooses all for a log.
+        ``DelayedModel``, of which inputs are late; ``LogModel``, of which actuators may
+        be slow; ``gpmpc.logs.learn``, which chooses all of these for a log.
     """
 
     state_dim: int  #: n, of what is measured
