@@ -17,6 +17,7 @@ import casadi
 import numpy as np
 import torch
 
+from gpmpc._angles import TURN
 from gpmpc._functions import DYNAMICS_RULE, call_dynamics
 from gpmpc._kernels import tape as tapes
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
@@ -82,6 +83,28 @@ def successor_function(plant: Any) -> casadi.Function:
     function = casadi.Function("successor", [x, u], [casadi.vertcat(*entries)])
     _check_numbers(function)
     return function
+
+
+def without_turns(function: casadi.Function, angles: Sequence[int]) -> casadi.Function:
+    """Writes a next state without the whole turns that lie between it and the state.
+
+    Args:
+        function: Of the state (n,) and other vectors, to the next state (n,).
+        angles: Indices of the states that are angles [rad].
+    """
+    try:
+        function = function if function.is_a("SXFunction") else function.expand()
+        symbol: Any = casadi.SX.sym
+    except RuntimeError:  # it calls what is no expression
+        symbol = casadi.MX.sym
+    arguments: list[Any] = [
+        symbol(f"argument{i}", function.size1_in(i)) for i in range(function.n_in())
+    ]
+    entries: list[Any] = casadi.vertsplit(function(*arguments))
+    for i in angles:
+        turns = casadi.floor((entries[i] - arguments[0][i]) / TURN + 0.5)
+        entries[i] = entries[i] - TURN * turns
+    return casadi.Function("counting", arguments, [casadi.vertcat(*entries)])
 
 
 def _check_numbers(function: casadi.Function) -> None:

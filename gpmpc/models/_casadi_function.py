@@ -114,9 +114,13 @@ class CasadiFunction:
         Args:
             angles: Indices of the states, and so of the value, that are angles [rad].
         """
+        from gpmpc.gp.casadi_ import without_turns  # loads CasADi
+
         if angles not in self._counting:
             wrapped = [i for i in angles if self._wraps(i)]
-            counting = self._unwrapped(wrapped) if wrapped else self
+            counting = self
+            if wrapped:
+                counting = CasadiFunction(without_turns(self.function, wrapped))
             self._counting[angles] = counting
         return self._counting[angles]
 
@@ -129,24 +133,6 @@ class CasadiFunction:
         after, *_ = self.linearize(*points)
         change = after[:, angle] - before[:, angle]
         return bool((whole_turns(change) == 0.0).all())
-
-    def _unwrapped(self, angles: Sequence[int]) -> "CasadiFunction":
-        """Returns the function with whole turns between value and state left out."""
-        import casadi
-
-        function = self.function
-        symbol = casadi.MX.sym if self.tape is None else casadi.SX.sym
-        arguments: list[Any] = [
-            symbol(f"x{i}", size) for i, size in enumerate(self.sizes)
-        ]
-        if self.tape is not None and not function.is_a("SXFunction"):
-            function = function.expand()
-        entries: list[Any] = casadi.vertsplit(function(*arguments))
-        for i in angles:
-            turns = casadi.floor((entries[i] - arguments[0][i]) / TURN + 0.5)
-            entries[i] = entries[i] - TURN * turns
-        value = casadi.vertcat(*entries)
-        return CasadiFunction(casadi.Function("counting", arguments, [value]))
 
     def linearize(self, *arguments: Array) -> tuple[Array, ...]:
         """Computes values and derivatives at K points.
