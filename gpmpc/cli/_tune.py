@@ -20,6 +20,7 @@ from rich.console import Console
 
 from gpmpc.cli._chunks import Job
 from gpmpc.cli._commands import Result
+from gpmpc.cli._composing import ComposedSettings
 from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import write_files
 from gpmpc.cli._overrides import choices, is_shared
@@ -58,8 +59,21 @@ class Tuning:
         self._controller: Any = experiment_of(self.base).controller
 
     def overrides(self, candidate: Candidate) -> list[str]:
-        """Returns the overrides of the flights of a candidate, without the seed."""
-        return [*self.fixed, *_overrides(candidate, self.base)]
+        """Returns the overrides of the flights of a candidate, without the seed.
+
+        ``KEY.i`` is entry i of the list KEY, whose others stay as what the candidate
+        chooses besides, such as its system, has them.
+        """
+        entries = {}
+        words = [*self.fixed]
+        for key, value in candidate.items():
+            if key.rpartition(".")[2].isdecimal():
+                entries[key] = value
+            else:
+                words.append(f"{key}={value}")
+        if entries:
+            words += _overrides_of_lists(entries, self.runs.job(words).settings)
+        return words
 
     def costs(self, candidates: Sequence[Candidate]) -> list[float]:
         """Flies candidates with every seed; returns the mean cost of each."""
@@ -194,27 +208,23 @@ def _interval(key: str, override: Override) -> Interval:
     )
 
 
-def _overrides(candidate: Candidate, base: DictConfig) -> list[str]:
-    """Returns the settings of a candidate.
+def _overrides_of_lists(entries: Candidate, settings: ComposedSettings) -> list[str]:
+    """Returns whole lists with new entries, ``KEY.i`` each; others are as set before.
 
-    ``KEY.i`` is entry i of the list KEY, whose others stay.
+    Raises:
+        SettingError: There is no such list, or entry.
     """
+    config = settings.config()
     lists: dict[str, list] = {}
-    overrides = []
-    for key, value in candidate.items():
+    for key, value in entries.items():
         parent, _, last = key.rpartition(".")
-        if not last.isdecimal():
-            overrides.append(f"{key}={value}")
-            continue
-        before: Any = OmegaConf.select(base, parent)
+        before: Any = OmegaConf.select(config, parent)
         if not OmegaConf.is_list(before) or int(last) >= len(before):
             raise SettingError(
                 key, f"{parent} is no list with such an entry; got {before}"
             )
         lists.setdefault(parent, list(before))[int(last)] = value
-    for key, values in lists.items():
-        overrides.append(f"{key}=[{','.join(map(str, values))}]")
-    return overrides
+    return [f"{key}=[{','.join(map(str, values))}]" for key, values in lists.items()]
 
 
 def _cost(job: Job, controller: Mapping[str, Any]) -> float:

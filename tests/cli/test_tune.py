@@ -7,14 +7,17 @@ import shlex
 from argparse import Namespace
 from types import SimpleNamespace
 
+import hydra
 import numpy as np
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+from rich.console import Console
 
 from gpmpc.cli import _tune
 from gpmpc.cli._settings import settings
 from gpmpc.cli._sweep import JobOutcome, Sweep
-from gpmpc.cli._tune import _cost
+from gpmpc.cli._tune import Tuning, _cost
 from gpmpc.exceptions import DataError
 from gpmpc.studies._document import json_text
 from tests.cli.command import forked
@@ -174,3 +177,14 @@ def test_a_flight_of_which_steps_are_lost_has_no_cost(tmp_path):
     path.write_bytes(data)
     with pytest.raises(DataError, match=r"5 of 20 steps are lost"):
         _cost(SimpleNamespace(folder=folder), controller)
+
+
+def test_entries_of_a_list_are_set_in_the_list_of_the_candidate_s_system():
+    Q = "controller.problem.cost.Q"
+    with settings():
+        runs = Sweep("tune", ["system=cart_pole"], Console(quiet=True))
+        candidate = {"system": "acrobot", f"{Q}.0": 7, "horizon": 3}
+        overrides = Tuning(runs, ["system=cart_pole"], 1).overrides(candidate)
+        of_acrobot = OmegaConf.select(hydra.compose("tune", ["system=acrobot"]), Q)
+    assert overrides[:-1] == ["system=cart_pole", "system=acrobot", "horizon=3"]
+    assert overrides[-1] == f"{Q}=[7,{','.join(map(str, of_acrobot[1:]))}]"

@@ -225,3 +225,11 @@ def test_attempts_that_were_ended_from_outside_are_counted(tmp_path):
         folder.begin("steps: 1\n")
         folder.finish({"settings": {}})
     assert folder.lost_attempts == 0
+
+
+def test_settings_that_are_no_number_do_not_differ_from_themselves():
+    def settings(bias):
+        return {"noise": {"std": float("nan")}, "gains": [{"a": float("nan")}, bias]}
+
+    assert difference(settings(2.0), settings(2)) == ""
+    assert difference(settings(2.0), settings(3)).startswith("gains: [{'a': nan}, 2.0] ")
