@@ -30,7 +30,7 @@ from rich.console import Console
 from benchmarks.timing import use_one_thread
 from gpmpc.calibration import Calibration, Recording, calibrate
 from gpmpc.cli._experiment import experiment_of
-from gpmpc.cli._settings import compose, settings
+from gpmpc.cli._settings import compose, settings_folders
 from gpmpc.datasets import RandomData
 from gpmpc.estimation import SeparatedNoise, separate_noise
 from gpmpc.gp import Trainer, Transitions, standardize
@@ -126,7 +126,7 @@ class Learned:
 
 def of_gallery(name: str, kind: str, flights: int, seed: int) -> Learned:
     """A plant of the gallery under its own controller."""
-    with settings():
+    with settings_folders():
         chosen = experiment_of(
             compose("run", [f"system={name}", f"seed={seed}", f"data.seed={seed}"])
         )

@@ -25,7 +25,7 @@ import numpy as np
 from rich.console import Console
 
 from gpmpc.cli._experiment import experiment_of
-from gpmpc.cli._settings import compose, settings
+from gpmpc.cli._settings import compose, settings_folders
 from gpmpc.gp.casadi_ import successor_function
 from gpmpc.models import CasadiFunction, KnownModel
 from gpmpc.mpc import GPMPC, Box, FlightJudge, PredictionSettings, Problem, Tracking
@@ -186,7 +186,7 @@ class Scenario:
 
 @lru_cache(maxsize=64)
 def _trained(overrides: tuple[str, ...]) -> Experiment:
-    with settings():
+    with settings_folders():
         chosen = experiment_of(compose("run", [*overrides]))
     training = chosen.learn(chosen.training_rows(), chosen.seed)
     return replace(chosen, model=training.posterior)

@@ -25,7 +25,7 @@ from rich.console import Console
 
 from benchmarks.timing import own_source
 from gpmpc.cli._experiment import experiment_of
-from gpmpc.cli._settings import compose, settings
+from gpmpc.cli._settings import compose, settings_folders
 from gpmpc.gp import Transitions
 from gpmpc.mpc import Tracking
 from gpmpc.studies._document import Table, terminal
@@ -60,7 +60,7 @@ class Circle:
 def experiment(name: str, seed: int) -> Experiment:
     """Returns one flight with the settings of a system's file."""
     word = "pendulum" if name == "circle" else name
-    with settings():
+    with settings_folders():
         chosen = experiment_of(
             compose("run", [f"system={word}", f"seed={seed}", f"data.seed={seed}"])
         )

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 import gpmpc
-from gpmpc.cli._settings import setting_names, settings
+from gpmpc.cli._settings import setting_names, settings_folders
 from tests.pages import BLOCK, ROOT, read
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
@@ -174,7 +174,7 @@ def test_every_page_with_python_is_followed_by_a_test():
 
 
 def test_the_settings_that_pages_name_are_there():
-    with settings():
+    with settings_folders():
         settings_of_run = {*setting_names("run")}
     named = {
         (path.name, name)

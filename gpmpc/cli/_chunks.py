@@ -93,9 +93,9 @@ def fly_chunk(chunk: Chunk) -> None:
 def _fly_job(job: Job) -> None:
     # Loads what flies, for seconds; who only hands out chunks does not need it.
     from gpmpc._compiling import report_compilation
-    from gpmpc.cli._run import RunSettings, run_one
+    from gpmpc.cli._run import RunToFly, run_one
 
-    to_fly = RunSettings(
+    to_fly = RunToFly(
         config=job.settings.config(),
         options=job.settings.options,
         choices=job.choices,
@@ -145,10 +145,11 @@ class Chunking:
             check_number("chunk", size, least=1, whole=True)
         self._size = None if isinstance(size, str) else size
         self._workers = workers
-        # Of the last runs, the first in a process left out.
+        # Of the last runs. The first one of each chunk, its leader, takes longer: it
+        # loads and compiles.
         self._seconds: deque[float] = deque(maxlen=_MEASURED)
-        self._first_seconds: deque[float] = deque(maxlen=_MEASURED)
-        self._first_in_process: set[RunFolder] = set()
+        self._seconds_of_leaders: deque[float] = deque(maxlen=_MEASURED)
+        self._leaders: set[RunFolder] = set()
 
     def measure(self, job: Job) -> None:
         """Takes the time of a run that has ended, as its folder tells."""
@@ -157,8 +158,8 @@ class Chunking:
         if began is None or ended is None or ended < began:
             return
         seconds = 1e-9 * (ended - began)
-        if job.folder in self._first_in_process:
-            self._first_seconds.append(seconds)
+        if job.folder in self._leaders:
+            self._seconds_of_leaders.append(seconds)
         else:
             self._seconds.append(seconds)
 
@@ -166,7 +167,7 @@ class Chunking:
         """Returns chunks of the runs that are to be flown, or of the first of them."""
         if self._size is not None:
             return self._grouped(jobs, self._size, most_work=None)
-        seconds = self._seconds or self._first_seconds
+        seconds = self._seconds or self._seconds_of_leaders
         if not seconds:
             processes = min(self._workers or 1, _MOST_FIRST)
             return self._grouped(jobs[: _FIRST * processes], _FIRST, most_work=_WORK)
@@ -181,6 +182,6 @@ class Chunking:
         chunks = []
         for start in range(0, len(jobs), size):
             group = tuple(jobs[start : start + size])
-            self._first_in_process.add(group[0].folder)
+            self._leaders.add(group[0].folder)
             chunks.append(Chunk(group, most_work))
         return chunks

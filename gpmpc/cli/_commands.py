@@ -68,18 +68,18 @@ class Subcommand:
         return parser
 
     @property
-    def choices(self) -> dict[str, list[str] | None]:
+    def values_by_argument(self) -> dict[str, list[str] | None]:
         """Values of every argument and option by name.
 
         Empty where any value goes, None for a flag, which takes none.
         """
-        choices: dict[str, list[str] | None] = {"-h": None, "--help": None}
+        values_by_name: dict[str, list[str] | None] = {"-h": None, "--help": None}
         for argument in self.arguments:
             values = None
             if argument.options.get("action") != "store_true":
                 values = [*argument.options.get("choices", ())]
-            choices |= dict.fromkeys(argument.names, values)
-        return choices
+            values_by_name |= dict.fromkeys(argument.names, values)
+        return values_by_name
 
 
 def _argument(*names: str, **options: Any) -> Argument:

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from gpmpc.cli._commands import COMMANDS, FLAGS, Result
-from gpmpc.cli._settings import group_options, setting_names, settings
+from gpmpc.cli._settings import group_options, setting_names, settings_folders
 from gpmpc.exceptions import GpmpcError
 
 _SCRIPTS = Path(__file__).with_name("completion")  # a file a shell
@@ -47,14 +47,16 @@ def candidates(line: str) -> list[str]:
 
 def _after_command(name: str, before: Sequence[str], word: str) -> list[str]:
     """Returns what may stand behind a command and the words before the last one."""
-    choices = COMMANDS[name].choices
-    if before and choices.get(before[-1]) is not None:  # the value of an option
-        return choices[before[-1]] or _files(word)
+    arguments = COMMANDS[name].values_by_argument
+    if before and arguments.get(before[-1]) is not None:  # the value of an option
+        return arguments[before[-1]] or _files(word)
     if word.startswith("-"):
-        return [option for option in (*choices, *FLAGS) if option.startswith("--")]
+        return [option for option in (*arguments, *FLAGS) if option.startswith("--")]
     if COMMANDS[name].has_settings:
         return _settings(name, before, word)
-    positional = [values for key, values in choices.items() if not key.startswith("-")]
+    positional = [
+        values for key, values in arguments.items() if not key.startswith("-")
+    ]
     if len(before) < len(positional):
         return positional[len(before)] or _files(word)
     return _files(word)
@@ -62,7 +64,7 @@ def _after_command(name: str, before: Sequence[str], word: str) -> list[str]:
 
 def _settings(name: str, before: Sequence[str], word: str) -> list[str]:
     """Returns settings that may follow, or what may stand behind the = of one."""
-    with settings():
+    with settings_folders():
         groups = group_options(name)
         names = setting_names(name)
         # What was typed before may be no setting yet, or a sweep.

@@ -112,7 +112,7 @@ class Composer:
         self._settable: set[tuple[tuple[str, ...], tuple[str, ...]]] = set()
         self._groups: dict[str, bool] = {}
 
-    def settings(self, words: Sequence[str]) -> ComposedSettings:
+    def composed(self, words: Sequence[str]) -> ComposedSettings:
         """Returns the settings of the run of some overrides.
 
         Raises:

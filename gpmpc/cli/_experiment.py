@@ -110,7 +110,7 @@ def _build(config: DictConfig) -> Experiment:
     if config.nominal:
         system = replace(system, nominal=_system_of(config.nominal))
     with open_dict(config):
-        size = config.data.pop("size")
+        size = config.data.pop("size")  # rows for the training; no DataSource takes it
         _complete_controller(config.controller, system)
     ((name, trajectory),) = config.trajectory.items()
     data = instantiate(config.data, _convert_="all")

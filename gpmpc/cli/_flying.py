@@ -31,7 +31,7 @@ _OF_THE_WHOLE_CHUNK = (Cause.CANCELLED, Cause.ERROR)
 
 
 class Job(Protocol):
-    """One run of a sweep."""
+    """One run of a sweep: what is asked of a ``_chunks.Job`` here."""
 
     @property
     def folder(self) -> RunFolder:
@@ -73,7 +73,9 @@ class Flying:
     #: why runs failed whose folders cannot be written, such as on a full disk, by path
     reasons_not_kept: dict[str, str] = field(default_factory=dict)
     _open: dict[str, Job] = field(default_factory=dict)  # by path, not settled yet
+    # When an attempt failed that does not count, by path; None: each one counts.
     _failed_before: dict[str, int | None] = field(default_factory=dict)
+    # When the last attempt before the launch began, by path; None: there was none.
     _begun_before: dict[str, int | None] = field(default_factory=dict)
 
     def fly(self, jobs: Iterable[Any]) -> None:
@@ -116,7 +118,7 @@ class Flying:
                 # It may have failed before this sweep looked.
                 self._failed_before |= dict.fromkeys(_paths(end.chunk))
             if end.cause is not None:
-                self._end_early(end)
+                self._settle_dead_chunk(end)
                 continue
             unsettled = self._unsettled(end.chunk)
             # A chunk may stop behind any of its runs, and leave the others.
@@ -158,8 +160,8 @@ class Flying:
         self.on_settled(job, state)
         return True
 
-    def _end_early(self, end: ChunkEnd) -> None:
-        """Settles what a process left behind that did not come to the end."""
+    def _settle_dead_chunk(self, end: ChunkEnd) -> None:
+        """Settles what a process left that died, or was ended, before its chunk."""
         lost_jobs = [
             job
             for job in self._unsettled(end.chunk)

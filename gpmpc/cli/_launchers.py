@@ -31,7 +31,10 @@ from gpmpc.studies._run_folder import RunFolder
 
 
 class Chunk(Protocol):
-    """Runs that one process flies, one after another; can be pickled."""
+    """Runs that one process flies: what launchers ask of a ``_chunks.Chunk``.
+
+    It can be pickled.
+    """
 
     @property
     def folders(self) -> Sequence[RunFolder]:

@@ -93,7 +93,8 @@ def _parse(name: str, command: Subcommand, words: Sequence[str]) -> argparse.Nam
     arguments, unknown = command.parser(name).parse_known_intermixed_args(words)
     if unknown:
         raise GpmpcError(
-            f"unknown option {unknown[0]!r}{nearest(unknown[0], command.choices)}; "
+            f"unknown option {unknown[0]!r}"
+            f"{nearest(unknown[0], command.values_by_argument)}; "
             f"gpmpc {name} --help lists what there is"
         )
     return arguments
@@ -110,14 +111,14 @@ def _run_with_settings(
     """Composes the settings, and shows them or runs the command with them."""
     from omegaconf import OmegaConf
 
-    from gpmpc.cli._settings import compose, help_text, model_file, settings
+    from gpmpc.cli._settings import compose, help_text, model_file, settings_folders
 
     arguments.config_name = arguments.config_name or name
     arguments.overrides = [
         override for word in arguments.overrides for override in model_file(word)
     ]
     flies_many = name == "tune" or getattr(arguments, "multirun", False)
-    with settings(arguments.config_dir):
+    with settings_folders(arguments.config_dir):
         if arguments.help:
             print(help_text(name))
             return Result()

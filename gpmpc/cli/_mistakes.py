@@ -6,7 +6,7 @@ from collections.abc import Callable
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from gpmpc.cli._settings import setting_names, settings
+from gpmpc.cli._settings import setting_names, settings_folders
 from gpmpc.cli._spelling import nearest
 from gpmpc.exceptions import GpmpcError
 
@@ -49,7 +49,7 @@ def _of_settings(error: Exception, name: str) -> str:
 
 def _unknown_setting(match: re.Match[str], name: str) -> str:
     setting = match["setting"]
-    with settings():
+    with settings_folders():
         question = nearest(setting, setting_names(name))
     return f"unknown setting {setting!r}{question}"
 

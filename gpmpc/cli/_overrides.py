@@ -91,6 +91,7 @@ def _name_of(key: str) -> str:
 def choices(overrides: Iterable[str]) -> list[str]:
     """Returns what distinguishes a run, ``key=value`` each in Hydra's own spelling.
 
+    They name its folder, and are the ``choices`` of its results.
     Of a key given twice, the last counts.
     """
     by_key = {}

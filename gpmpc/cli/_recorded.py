@@ -23,7 +23,10 @@ _NO_SETTINGS = "holds no settings, which gpmpc run puts into its recordings"
 
 
 def recordings(run: Path) -> list[Path]:
-    """Returns the recordings of a run's folder, of one above it, or of a file."""
+    """Returns the recordings of a run's folder, of one above it, or of a file.
+
+    Those of episodes, ``episode_1.mcap`` and so on, are named as files.
+    """
     if not run.is_dir():
         return [run]
     if (run / RECORDING).exists():

@@ -56,7 +56,7 @@ Warn = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class RunSettings:
+class RunToFly:
     """What is flown, and where it is kept."""
 
     config: DictConfig
@@ -93,11 +93,12 @@ def run(config: DictConfig) -> Result:
         report_compilation(),
         remarks_to(print_error),
     ):
-        # What a user can get wrong is found before anything is written.
+        # What a user can get wrong is found before anything is written; the objects
+        # that fly are made again in ``_fly``, where an error is kept in the folder.
         experiment_of(config)
         words = choices(HydraConfig.get().overrides.task)
         hydra_settings = HydraConfig.get()
-        to_fly = RunSettings(
+        to_fly = RunToFly(
             config=config,
             options=hydra_settings.runtime.choices,
             choices=words,
@@ -158,9 +159,7 @@ def _warning_printer() -> Warn:
     return warn
 
 
-def run_one(
-    to_fly: RunSettings, wait: bool = True, warn: Warn | None = None
-) -> Outcome:
+def run_one(to_fly: RunToFly, wait: bool = True, warn: Warn | None = None) -> Outcome:
     """Flies one run unless its folder is finished; an error is kept in the folder.
 
     So is the end of the process (``sys.exit``) that code of the user's asked for.
@@ -230,7 +229,7 @@ def _was_interrupted(error: BaseException | None) -> bool:
     return error is not None
 
 
-def _fly(to_fly: RunSettings, yaml_text: str, warn: Warn | None) -> dict[str, Any]:
+def _fly(to_fly: RunToFly, yaml_text: str, warn: Warn | None) -> dict[str, Any]:
     """Trains, flies and records; returns the metrics.
 
     Args:
@@ -254,7 +253,7 @@ class _Recordings:
         yaml_text: The same as text, which is put into every recording.
     """
 
-    def __init__(self, experiment: Experiment, to_fly: RunSettings, yaml_text: str):
+    def __init__(self, experiment: Experiment, to_fly: RunToFly, yaml_text: str):
         self._experiment = experiment
         self._yaml_text = yaml_text
         self._command = to_fly.command

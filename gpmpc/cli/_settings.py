@@ -35,7 +35,7 @@ def config_folder() -> Path:
 
 
 @contextmanager
-def settings(own: str | None = None) -> Iterator[None]:
+def settings_folders(own: str | None = None) -> Iterator[None]:
     """Lets Hydra find the package's settings, and behind them those in ``own``."""
     if own is not None:
         folder = Path(own)

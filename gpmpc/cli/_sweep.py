@@ -41,13 +41,13 @@ from gpmpc.exceptions import SettingError, check_number
 from gpmpc.studies._index import RunIndex
 from gpmpc.studies._run_folder import (
     METRICS,
-    PLAN,
+    PLAN_PREFIX,
     RunFolder,
     RunState,
     folder_name,
     of_other_code,
 )
-from gpmpc.studies._run_record import DAMAGE, warning_of
+from gpmpc.studies._run_record import READ_ERRORS, warning_of
 from gpmpc.studies._sweep_status import without_numbers
 
 _MEASURED = 20  # finished runs whose times tell how long others take
@@ -101,7 +101,7 @@ class Sweep:
         return Job(
             choices=words,
             folder=folder,
-            settings=self._composer.settings(overrides),
+            settings=self._composer.composed(overrides),
             failed_before=folder.failed_at,
         )
 
@@ -152,7 +152,7 @@ class Sweep:
 
     def _add_to_index(self, path: Path, result: Any, fingerprint: str | None) -> None:
         """Keeps what a report shows of a run, unless it is of an older version."""
-        with suppress(*DAMAGE):
+        with suppress(*READ_ERRORS):
             self._index.add(path, result, fingerprint)
 
     def fly(self, jobs: Sequence[Job]) -> list[JobOutcome]:
@@ -336,7 +336,7 @@ def sweep(arguments: Namespace) -> Result:
             with runs.progress(jobs, len(jobs)):
                 outcomes = runs.fly(jobs)
         except OSError as error:
-            return _ended_early(runs.tree, error)
+            return _cannot_go_on(runs.tree, error)
     end = _end_of(jobs, outcomes, finished_before)
     text = f"{end.line()}{_count_warnings(runs.warnings)}; in {runs.tree}"
     console.out(text, highlight=False)
@@ -360,7 +360,7 @@ def print_failed(outcomes: Iterable[JobOutcome]) -> None:
         print_error(f"failed: {outcome.folder}: {outcome.error}")
 
 
-def _ended_early(tree: Path, error: OSError) -> Result:
+def _cannot_go_on(tree: Path, error: OSError) -> Result:
     """Says that the command cannot go on, such as where a disk is full."""
     place = error.filename or tree
     reason = f"{place}: {error.strerror or error}"
@@ -431,7 +431,7 @@ def _write_plan(tree: Path, jobs: Sequence[Job], options: Sequence[str]) -> None
         content["search_options"] = shlex.join(options)
     plan = json.dumps(content, indent=1) + "\n"
     digest = hashlib.sha256(plan.encode()).hexdigest()
-    write_files(tree, {f"{PLAN}{digest[:10]}.json": plan})
+    write_files(tree, {f"{PLAN_PREFIX}{digest[:10]}.json": plan})
 
 
 def _count_warnings(warnings: Mapping[Path, str]) -> str:

@@ -8,7 +8,7 @@ from rich.console import Console
 from gpmpc._compiling import report_compilation
 from gpmpc.cli._commands import Result
 from gpmpc.cli._experiment import experiment_of
-from gpmpc.cli._settings import compose, settings
+from gpmpc.cli._settings import compose, settings_folders
 from gpmpc.cli._terminal import progress_bar
 from gpmpc.studies.flight import run_trial
 
@@ -25,7 +25,7 @@ def warmup(arguments: argparse.Namespace) -> Result:
     """Flies two steps with every controller, and prints how long that took."""
     console = Console()
     began = time.perf_counter()
-    with progress_bar(console) as bar, report_compilation(), settings():
+    with progress_bar(console) as bar, report_compilation(), settings_folders():
         task = bar.add_task("", total=len(_CONTROLLERS))
         for controller in _CONTROLLERS:
             bar.update(task, description=f"compiling what {controller} needs")

@@ -14,7 +14,7 @@ WRONG_ORDER = "wrong order"
 NO_CHECKSUMS = "no checksums"  # what is altered would not be noticed
 RECOVERED = "recovered"  # the file holds what was left of another
 #: with which a recording without steps is none
-DAMAGE = (LOST_CHUNKS, LOST_STEPS, LOST_MESSAGES, DAMAGED_RECORDS, WRONG_CHECKSUM)
+DAMAGE_KINDS = (LOST_CHUNKS, LOST_STEPS, LOST_MESSAGES, DAMAGED_RECORDS, WRONG_CHECKSUM)
 
 
 @dataclass(frozen=True)

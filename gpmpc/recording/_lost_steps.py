@@ -6,7 +6,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpmpc.recording._content import FileContent
-from gpmpc.recording._flaws import DAMAGE, LOST_STEPS, WRONG_COUNT, WRONG_ORDER, Flaw
+from gpmpc.recording._flaws import (
+    DAMAGE_KINDS,
+    LOST_STEPS,
+    WRONG_COUNT,
+    WRONG_ORDER,
+    Flaw,
+)
 from gpmpc.recording._schema import STEP
 
 _MOST_SPANS = 3  # of lost steps that are named
@@ -69,7 +75,7 @@ def _recorded_steps(
     A damaged file: the index. A whole one: the larger of index and end. Without both:
     the largest sequence number.
     """
-    is_damaged = any(flaw.kind in DAMAGE for flaw in content.flaws)
+    is_damaged = any(flaw.kind in DAMAGE_KINDS for flaw in content.flaws)
     if is_damaged and by_index is not None:  # which has a checksum of its own
         return _Count(by_index, str(by_index))
     # What rewrites a file makes a new index, and keeps the end.

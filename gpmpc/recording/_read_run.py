@@ -23,7 +23,7 @@ from gpmpc.recording._decoding import (
     input_bounds,
     plan_arrays,
 )
-from gpmpc.recording._flaws import DAMAGE, DAMAGED_RECORDS, RECOVERED, Flaw
+from gpmpc.recording._flaws import DAMAGE_KINDS, DAMAGED_RECORDS, RECOVERED, Flaw
 from gpmpc.recording._lost_steps import step_flaws
 from gpmpc.recording._run import TIMINGS, Run
 from gpmpc.recording._schema import RECOVERY_METADATA
@@ -53,7 +53,7 @@ def read_run(path: str | Path) -> Run:
         flaws.append(Flaw(DAMAGED_RECORDS, 1, text))
     messages = decode_messages(path, content, names)
     flaws += step_flaws(content, messages.steps, flaws)
-    if not messages.steps and any(flaw.kind in DAMAGE for flaw in flaws):
+    if not messages.steps and any(flaw.kind in DAMAGE_KINDS for flaw in flaws):
         reasons = "; ".join(flaw.text for flaw in flaws)
         raise RecordingError(f"{path}: no step of it can be read: {reasons}")
     flaws += _recovery_flaw(content)

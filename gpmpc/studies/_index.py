@@ -28,8 +28,8 @@ from filelock import lock_descriptor
 from gpmpc.studies._document import plain_text
 from gpmpc.studies._run_folder import ERROR, METRICS
 from gpmpc.studies._run_record import (
-    DAMAGE,
     MEASURES,
+    READ_ERRORS,
     RunRecord,
     Settings,
     read_record,
@@ -76,7 +76,7 @@ class RunIndex:
         """Returns the run of a ``metrics.json`` or ``error.json``.
 
         Raises:
-            DAMAGE: The file is none that a run writes.
+            READ_ERRORS: The file is none that a run writes.
         """
         line = self._valid_line(path)
         if line is not None:
@@ -91,10 +91,11 @@ class RunIndex:
         Args:
             path: Its ``metrics.json`` or ``error.json``.
             content: Of the file; None reads it.
-            fingerprint: Of the settings that it was compared with.
+            fingerprint: Of the settings that a sweep asked for, where it has compared
+                them with the run's and they are the same.
 
         Raises:
-            DAMAGE: The file is none that a run writes.
+            READ_ERRORS: The file is none that a run writes.
         """
         status = path.stat()
         if content is None:
@@ -162,7 +163,7 @@ class RunIndex:
             return
         with file:
             for text in file:
-                with suppress(*DAMAGE):
+                with suppress(*READ_ERRORS):
                     self._read_line(json.loads(text), self._tree)
 
     def _read_line(self, content: dict[str, Any], tree: Path) -> None:

@@ -19,8 +19,8 @@ from gpmpc._provenance import code_fingerprint_or_none, flattened, own_code
 from gpmpc.studies._document import plain_text
 from gpmpc.studies._run_folder import ERROR, describe_code
 
-# Whatever the content of a damaged file may raise.
-DAMAGE = (
+# Whatever the content of a damaged file may raise when it is read.
+READ_ERRORS = (
     OSError,
     ValueError,
     KeyError,
@@ -39,7 +39,8 @@ class Measure(NamedTuple):
 
     #: with its unit; {unit} stands for that of the runs' positions or angles
     label: str
-    #: takes it from the result of a run; None where the run has none
+    #: takes it from the result of a run; None where the run has none. It may not raise
+    #: for results of older versions: such runs would be skipped
     of: Callable[[Result], float | None]
 
 

@@ -26,13 +26,13 @@ from gpmpc.studies._index import RunIndex
 from gpmpc.studies._run_folder import (
     ERROR,
     METRICS,
-    PLAN,
+    PLAN_PREFIX,
     folder_name,
     folder_override,
 )
 from gpmpc.studies._run_record import (
-    DAMAGE,
     MEASURES,
+    READ_ERRORS,
     Choices,
     RunRecord,
     parsed,
@@ -187,7 +187,7 @@ def _read_files(tree: Path) -> _Files:
             indices[runs] = RunIndex(runs)
         try:
             files.runs.append(indices[runs].record(path))
-        except DAMAGE as error:
+        except READ_ERRORS as error:
             files.skipped.append(_why_skipped(path, "run", error))
             files.unread_folders.add(path.parent.name)
     for index in indices.values():
@@ -195,7 +195,7 @@ def _read_files(tree: Path) -> _Files:
     for path in paths.plans:
         try:
             files.planned += _planned_runs(_read_json(path))
-        except DAMAGE as error:
+        except READ_ERRORS as error:
             files.skipped.append(_why_skipped(path, "sweep", error))
             files.unread_folders.add(path.parent.name)
     return files
@@ -220,7 +220,7 @@ class _Paths:
             plans += [
                 Path(folder, file)
                 for file in files
-                if file.startswith(PLAN) and file.endswith(".json")
+                if file.startswith(PLAN_PREFIX) and file.endswith(".json")
             ]
         names: dict[str, str] = {}  # of the result, by folder
         for name, folders in results.items():

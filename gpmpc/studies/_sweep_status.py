@@ -22,7 +22,7 @@ from gpmpc.studies._run_folder import (
     CONFIG,
     ERROR,
     METRICS,
-    PLAN,
+    PLAN_PREFIX,
     RunFolder,
     RunState,
     folder_name,
@@ -195,7 +195,7 @@ def without_numbers(text: str) -> str:
 def _sweeps(tree: str) -> Iterator[str]:
     """Yields the folders that hold runs, not those below them."""
     for folder, children, files in os.walk(tree):
-        is_sweep = any(name.startswith(PLAN) for name in files)
+        is_sweep = any(name.startswith(PLAN_PREFIX) for name in files)
         if is_sweep or any(_is_run(f"{folder}/{name}") for name in children):
             children.clear()
             yield folder
@@ -210,7 +210,7 @@ def _plans(folder: str) -> list[str]:
         return [
             entry.path
             for entry in entries
-            if entry.name.startswith(PLAN) and entry.name.endswith(".json")
+            if entry.name.startswith(PLAN_PREFIX) and entry.name.endswith(".json")
         ]
 
 

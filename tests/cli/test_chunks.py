@@ -16,7 +16,7 @@ from gpmpc.cli._chunks import Chunk, Chunking, Job, fly_chunk
 from gpmpc.cli._composing import Composer
 from gpmpc.cli._examples import Examples
 from gpmpc.cli._overrides import choices, combinations
-from gpmpc.cli._settings import settings
+from gpmpc.cli._settings import settings_folders
 from gpmpc.cli._sweep import Sweep, _Ends
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.studies._index import RunIndex
@@ -26,7 +26,7 @@ from tests.studies.made_up import metrics_of
 
 @pytest.fixture(scope="module", autouse=True)
 def composing():
-    with settings():
+    with settings_folders():
         yield
 
 
@@ -36,7 +36,7 @@ def jobs_of(tree, *words):
         Job(
             choices=choices(overrides),
             folder=RunFolder(tree / folder_name(choices(overrides))),
-            settings=composer.settings(overrides),
+            settings=composer.composed(overrides),
         )
         for overrides in combinations(words)
     ]

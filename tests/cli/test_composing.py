@@ -41,7 +41,7 @@ def composing(tmp_path, monkeypatch):
     """Settings in a folder that a test may add files to."""
     shutil.copytree(_settings.config_folder(), tmp_path / "conf")
     monkeypatch.setattr(_settings, "config_folder", lambda: tmp_path / "conf")
-    with _settings.settings():
+    with _settings.settings_folders():
         yield tmp_path / "conf"
 
 
@@ -57,7 +57,7 @@ def by_hydra(words, name="run"):
 def test_all_settings_are_those_that_hydra_composes():
     shared = composer()
     for words in [*MANY, *MANY]:  # once composed, and once taken from what was
-        composed = shared.settings(words)
+        composed = shared.composed(words)
         config, options = by_hydra(words)
         assert composed.config() == config, words
         assert dict(composed.options) == options
@@ -78,7 +78,7 @@ def test_a_thousand_seeds_are_composed_once(monkeypatch):
         hydra, "compose", lambda *a, **b: composed.append(a) or original(*a, **b)
     )
     for words in combinations(["controller=convex,lqr", "seed=range(500)", "steps=2"]):
-        config = shared.settings(words)
+        config = shared.composed(words)
     assert len(composed) == 2
     assert config.config().seed == 499
     assert config.config().steps == 2
@@ -89,7 +89,7 @@ def test_a_thousand_seeds_are_composed_once(monkeypatch):
 )
 def test_what_hydra_refuses_is_refused_in_its_words(words):
     with pytest.raises(HydraException) as ours:
-        composer().settings(["seed=1", *words])
+        composer().composed(["seed=1", *words])
     with pytest.raises(HydraException) as theirs:
         by_hydra(["seed=1", *words])
     assert str(ours.value) == str(theirs.value)
@@ -101,7 +101,7 @@ def test_settings_that_ask_hydra_are_composed_for_every_run(composing):
     )
     shared = composer("mine")
     for seed in (1, 2):
-        config = shared.settings([f"seed={seed}"]).config()
+        config = shared.composed([f"seed={seed}"]).config()
         assert config.words == f"seed={seed}"
         assert config.seed == seed
 
@@ -114,14 +114,14 @@ def test_a_time_that_was_asked_for_once_stays(composing):
     folder = first.folder
     shared = Composer("timed", first)
     for words in (["seed=1"], ["controller=lqr"]):
-        assert shared.settings(words).config().folder == folder
+        assert shared.composed(words).config().folder == folder
 
 
 def test_a_fingerprint_differs_where_a_result_may(tmp_path):
     shared = composer()
 
     def fingerprint(*words):
-        return shared.settings(words).fingerprint()
+        return shared.composed(words).fingerprint()
 
     prints = [
         fingerprint(*words)

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from gpmpc.cli._plain_settings import plain_data
 from gpmpc.cli._recorded import errors_of_settings, experiment_of_run
 from gpmpc.cli._recorded_settings import checked_settings, read_settings
-from gpmpc.cli._settings import compose, settings
+from gpmpc.cli._settings import compose, settings_folders
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.recording import read_run
 from tests.cli.command import copied_process, forked
@@ -33,7 +33,7 @@ import numpy as np
 
 @cache
 def _flight(*words):
-    with settings():
+    with settings_folders():
         return json.dumps(plain_data(compose("run", ["data.samples=12", *words])))
 
 
@@ -325,7 +325,7 @@ def test_an_ordinary_flights_settings_describe_the_same_flight(words):
     from gpmpc.cli._experiment import experiment_of, experiment_of_file
 
     document = flight(*words)
-    with settings():
+    with settings_folders():
         expected = experiment_of(OmegaConf.create(document))
     text = OmegaConf.to_yaml(OmegaConf.create(document))
     experiment = experiment_of_file(read_settings(text), [])

@@ -10,8 +10,8 @@ from hydra.core.hydra_config import HydraConfig
 from gpmpc.cli import _run
 from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import writing
-from gpmpc.cli._run import RunSettings, run_one
-from gpmpc.cli._settings import compose, settings
+from gpmpc.cli._run import RunToFly, run_one
+from gpmpc.cli._settings import compose, settings_folders
 from gpmpc.exceptions import SettingError
 from gpmpc.mpc import Box
 from gpmpc.recording import read_run
@@ -21,10 +21,10 @@ from gpmpc.systems import translational
 
 
 def to_fly(tree, *overrides):
-    with settings():
+    with settings_folders():
         config = compose("run", ["recorder=none", *overrides])
         options = HydraConfig.get().runtime.choices
-    return RunSettings(
+    return RunToFly(
         config=config,
         options=options,
         choices=[],

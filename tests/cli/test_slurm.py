@@ -13,7 +13,7 @@ import pytest
 
 from gpmpc.cli import _flying, _slurm
 from gpmpc.cli._flying import Flying
-from gpmpc.cli._settings import settings
+from gpmpc.cli._settings import settings_folders
 from gpmpc.cli._slurm import Slurm
 from gpmpc.exceptions import GpmpcError, SettingError
 from tests.cli.launched import fly, in_chunks, jobs_of
@@ -335,7 +335,7 @@ def test_the_page_s_settings_are_taken():
         "hydra.launcher.additional_parameters={nice: 100}",
         "hydra.launcher.setup=[module load python]",
     ]
-    with settings():
+    with settings_folders():
         launcher = hydra.compose("run", words, return_hydra_config=True).hydra.launcher
     assert launcher.name == "slurm"
     assert launcher.additional_parameters == {"nice": 100}

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from gpmpc.cli import _tune
-from gpmpc.cli._settings import settings
+from gpmpc.cli._settings import settings_folders
 from gpmpc.cli._sweep import JobOutcome, Sweep
 from gpmpc.cli._tune import Tuning, _cost
 from gpmpc.exceptions import DataError
@@ -107,7 +107,7 @@ def test_flights_that_failed_are_told_and_cost_no_number(tmp_path, monkeypatch, 
         batch=1,
         seeds=1,
     )
-    with settings():
+    with settings_folders():
         result = _tune.tune(arguments)
     (failed,) = result.data["failed"]
     said = capsys.readouterr().err.splitlines()
@@ -181,7 +181,7 @@ def test_a_flight_of_which_steps_are_lost_has_no_cost(tmp_path):
 
 def test_entries_of_a_list_are_set_in_the_list_of_the_candidate_s_system():
     Q = "controller.problem.cost.Q"
-    with settings():
+    with settings_folders():
         runs = Sweep("tune", ["system=cart_pole"], Console(quiet=True))
         candidate = {"system": "acrobot", f"{Q}.0": 7, "horizon": 3}
         overrides = Tuning(runs, ["system=cart_pole"], 1).overrides(candidate)

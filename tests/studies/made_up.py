@@ -12,7 +12,7 @@ from gpmpc.mpc import Box, Timing
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
 from gpmpc.studies._document import terminal
-from gpmpc.studies._run_folder import PLAN, RunFolder, folder_name, run_header
+from gpmpc.studies._run_folder import PLAN_PREFIX, RunFolder, folder_name, run_header
 from gpmpc.studies.flight import Experiment, Flown, metrics
 from gpmpc.studies.report import report_document
 from gpmpc.systems import translational
@@ -92,7 +92,7 @@ def made_up_run(tree, choices, settings, result=None, error=None):
 
 def plan(tree, runs):
     tree.mkdir(parents=True, exist_ok=True)
-    (tree / f"{PLAN}0.json").write_text(json.dumps({"runs": runs}))
+    (tree / f"{PLAN_PREFIX}0.json").write_text(json.dumps({"runs": runs}))
 
 
 def chosen(controller, seed, **more):

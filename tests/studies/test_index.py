@@ -8,7 +8,7 @@ import pytest
 
 from gpmpc.studies import _index
 from gpmpc.studies._index import INDEX, RunIndex
-from gpmpc.studies._run_folder import PLAN
+from gpmpc.studies._run_folder import PLAN_PREFIX
 from gpmpc.studies.report import read_report, report_document
 from tests.studies.made_up import chosen, made_up_run, metrics_of
 
@@ -140,7 +140,9 @@ def test_two_writers_add_their_lines(tree):
 
 def test_runs_below_several_folders_have_an_index_each(tree, reads):
     shutil.copytree(tree, tree / "below" / "sweep")
-    (tree / "below" / "sweep" / f"{PLAN}1.json").write_text('{"runs": [["seed=9"]]}')
+    (tree / "below" / "sweep" / f"{PLAN_PREFIX}1.json").write_text(
+        '{"runs": [["seed=9"]]}'
+    )
     first = files(tree)
     assert (tree / "below" / "sweep" / INDEX).exists()
     reads.clear()

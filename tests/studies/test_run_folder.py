@@ -232,4 +232,6 @@ def test_settings_that_are_no_number_do_not_differ_from_themselves():
         return {"noise": {"std": float("nan")}, "gains": [{"a": float("nan")}, bias]}
 
     assert difference(settings(2.0), settings(2)) == ""
-    assert difference(settings(2.0), settings(3)).startswith("gains: [{'a': nan}, 2.0] ")
+    assert difference(settings(2.0), settings(3)).startswith(
+        "gains: [{'a': nan}, 2.0] "
+    )

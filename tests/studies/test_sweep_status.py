@@ -7,7 +7,7 @@ import time
 import pytest
 
 from gpmpc.exceptions import DataError
-from gpmpc.studies._run_folder import PLAN, RunFolder, RunState
+from gpmpc.studies._run_folder import PLAN_PREFIX, RunFolder, RunState
 from gpmpc.studies._sweep_status import SweepStatus, SweepWatch
 from tests.studies.made_up import plan
 
@@ -74,7 +74,7 @@ def test_each_look_sees_what_has_changed(tree):
     assert watch.look().counts[RunState.FAILED] == 3
     (tree / "seed=4" / "error.json").write_text('{"error": "another"}')
     os.rename(tree / "seed=7" / "config.yaml", tree / "seed=7" / "metrics.json")
-    (tree / f"{PLAN}1.json").write_text('{"runs": [["seed=99"], ["seed=1"]]}')
+    (tree / f"{PLAN_PREFIX}1.json").write_text('{"runs": [["seed=99"], ["seed=1"]]}')
     status = watch.look()
     assert status.total == 13
     assert status.counts[RunState.FINISHED] == 5
@@ -96,7 +96,7 @@ def test_nobody_works_on_a_sweep_that_was_stopped(ago, tmp_path):
 
 def test_sweeps_below_a_folder_are_counted_together(tree):
     plan(tree.parent / "other", [["seed=0"], ["seed=1"]])
-    (tree.parent / "other" / f"{PLAN}damaged.json").write_text("{")
+    (tree.parent / "other" / f"{PLAN_PREFIX}damaged.json").write_text("{")
     assert SweepWatch(tree.parent).look().total == 14
 
 
