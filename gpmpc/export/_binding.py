@@ -364,26 +364,37 @@ def view(numbers: Any) -> Array:
 
 
 def _continue(fields: Any, previous: Decision) -> None:
-    """Writes the last decision to what the code keeps."""
+    """Writes the last decision to what the code keeps.
+
+    Of a decision of another controller, of other sizes, only the input counts.
+    """
+    _check_shape("input of the last decision", previous.input, (len(fields.input),))
+    sizes = (view(fields.means).shape, view(fields.inputs).shape)
+    fits = (np.shape(previous.means), np.shape(previous.inputs)) == sizes
     memory = getattr(previous, "memory", None)
-    if memory is not None:
+    if fits and memory is not None and len(memory) == ctypes.sizeof(fields):
         ctypes.memmove(ctypes.byref(fields), memory, ctypes.sizeof(fields))
-    elif previous.solution is not None:
+    elif fits and previous.solution is not None:
         _write_solution(fields.solution, previous.solution)
     view(fields.input)[:] = previous.input
-    if previous.disturbance is not None:
+    if fits and previous.disturbance is not None:
         view(fields.disturbance)[:] = previous.disturbance
     fields.has_input = int(np.isfinite(previous.input).all())
-    fields.has_plan = int(previous.applicable)
-    if previous.applicable:
+    fields.has_plan = int(fits and previous.applicable)
+    if fields.has_plan:
         view(fields.means)[:] = previous.means
         view(fields.inputs)[:] = previous.inputs
 
 
 def _write_solution(target: Any, solution: QPSolution) -> None:
-    """Writes the last program's solution in Python to what the code starts from."""
+    """Writes the last program's solution in Python to what the code starts from.
+
+    One of more rows than there are, or of another method, is no guess.
+    """
     n = len(solution.x)
     M = len(solution.caps)
+    if n != len(target.x) or len(target.label) < M or not len(solution.record):
+        return
     labels = layout.working_labels(solution.record, n, M)
     target.status = int(solution.record[layout.STATUS])
     target.rows = M - n

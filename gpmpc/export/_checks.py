@@ -25,6 +25,7 @@ def check_exportable(controller: Any, on_failure: str) -> None:
     check_choice("on_failure", on_failure, ("previous_plan", "hold"))
     _check_weighed_states(controller)
     _check_programs(controller)
+    _check_clock("budget", controller.budget)
     _check_covariance(controller)
     _check_solver(controller.solver)
 
@@ -45,6 +46,13 @@ def _check_programs(controller: GPMPC) -> None:
         raise SettingError("iterations", f"{rule}; got {controller.iterations}")
 
 
+def _check_clock(key: str, limit: float | None) -> None:
+    """Raises where a time ends a decision."""
+    if limit is not None:
+        rule = "an exported step knows no clock; take the solver's iteration_limit"
+        raise SettingError(key, f"{rule}; got {limit}")
+
+
 def _check_covariance(controller: GPMPC) -> None:
     """Raises unless covariances are first-order ones, or none."""
     settings = controller.prediction.settings
@@ -62,6 +70,4 @@ def _check_solver(solver: Any) -> None:
     if not isinstance(solver, DualActiveSet):
         rule = "an exported one is DualActiveSet()"
         raise SettingError("solver", f"{rule}; got {type(solver).__name__}")
-    if solver.time_limit is not None:
-        rule = "an exported step knows no clock; take iteration_limit"
-        raise SettingError("solver.time_limit", f"{rule}; got {solver.time_limit}")
+    _check_clock("solver.time_limit", solver.time_limit)

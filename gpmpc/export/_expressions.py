@@ -117,10 +117,10 @@ class Graph:
         if operation == tapes.MUL:
             if first == 0.0 or second == 0.0:
                 return self.constant(0.0)
-            if first == 1.0:
-                return b
-            if second == 1.0:
-                return a
+            if first in (1.0, -1.0):
+                return b if first > 0 else self.unary(tapes.NEG, b)
+            if second in (1.0, -1.0):
+                return a if second > 0 else self.unary(tapes.NEG, a)
         if operation == tapes.DIV and second == 1.0:
             return a
         if operation in (tapes.POW, tapes.CONSTPOW) and second is not None:

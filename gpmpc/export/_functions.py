@@ -7,7 +7,7 @@ import numpy as np
 
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.export._expressions import expansion_lines, graph_of_tape
-from gpmpc.export._text import Numbers, function
+from gpmpc.export._text import Numbers, function, unused
 from gpmpc.models import CasadiFunction
 from gpmpc.mpc import GPMPC, Inequality
 from gpmpc.mpc._controller import read_parameters
@@ -48,7 +48,8 @@ class FunctionWriter:
             count = len(constraint.rows(self._horizon).F)
             if isinstance(constraint, Inequality):
                 name = f"inequality{i}"
-                self._write_function("h", constraint.h, constraint.count, name)
+                note = f"h(x, u, p) of constraint {i}, and its derivatives by (x, u)"
+                self._write_function("h", constraint.h, constraint.count, name, note)
                 body += [
                     "{",
                     f"    real value[{count}];",
@@ -68,7 +69,7 @@ class FunctionWriter:
             "static void constraints(const real *x, const real *u, const real *p,\n"
             "    real *h, real *E, real *D)"
         )
-        self._function(signature, body, "h(x, u, p) <= 0")
+        self._function(signature, body, "h(x, u, p) <= 0 of all rows, and E, D by x, u")
 
     def _write_outputs(self, outputs: Sequence[Any]) -> None:
         """Writes the squares Z = [J, e]' W [J, e] of the outputs along a plan."""
@@ -85,7 +86,8 @@ class FunctionWriter:
         for i, output in enumerate(outputs):
             name = f"output{i}"
             count = output.weight.shape[-1]
-            self._write_function("y", output.y, count, name)
+            note = f"y(x, u, p) of output {i}, and its derivatives by (x, u)"
+            self._write_function("y", output.y, count, name, note)
             weight = by_stage("weight", output.weight, self._horizon, 2)
             centre = by_stage("reference", output.reference, self._horizon, 1)
             table = self._numbers.table
@@ -99,7 +101,9 @@ class FunctionWriter:
         )
         self._function(signature, body, "squares of y(x, u, p) - c along the plan")
 
-    def _write_function(self, key: str, smooth: Any, count: int, name: str) -> None:
+    def _write_function(
+        self, key: str, smooth: Any, count: int, name: str, note: str
+    ) -> None:
         """Writes a function of (x, u, p) with its derivatives by x and u."""
         if not hasattr(smooth, "n_in"):
             rule = "an exported function is one of CasADi"
@@ -130,9 +134,12 @@ class FunctionWriter:
             f"static void {name}(const real *x, const real *u, const real *p,\n"
             "    real *value, real *jacobian)"
         )
-        unused = ["(void)x;", "(void)u;", "(void)p;"]
         size = count * (self._n + self._m)
-        self._function(signature, [*unused, f"fill(jacobian, 0, {size});", *lines], key)
+        self._function(
+            signature,
+            [*unused("xup", lines), f"fill(jacobian, 0, {size});", *lines],
+            note,
+        )
 
     def _function(self, signature: str, body: Sequence[str], note: str) -> None:
         """Writes a function, what it computes above it."""

@@ -10,7 +10,7 @@ from gpmpc._dynamics import to_array
 from gpmpc.exceptions import SettingError
 from gpmpc.export._expressions import expansion_lines, graph_of_tape, value_lines
 from gpmpc.export._fixed import fixed_tables
-from gpmpc.export._text import Numbers, function, integers, split_jacobian
+from gpmpc.export._text import Numbers, function, integers, split_jacobian, unused
 from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, DelayedModel, DisturbedModel, KnownModel, ResidualModel
 from gpmpc.models._wrapper import LinearWrapper
@@ -25,8 +25,6 @@ _TAPE_SIGNATURE = "static void {name}(const real *x, const real *u, real *value)
 _TAPE_EXPANSION = (
     "static void {name}(const real *x, const real *u, real *value, real *jacobian)"
 )
-# a function need not depend on both
-_UNUSED = ("(void)x;", "(void)u;")
 
 
 class ModelWriter:
@@ -253,13 +251,13 @@ class ModelWriter:
             lines = value_lines(graph, value, names, self._numbers)
             self._function(
                 _TAPE_SIGNATURE.format(name=f"{name}_value"),
-                [*_UNUSED, *lines],
+                [*unused("xu", lines), *lines],
                 "f0(x, u)",
             )
         lines = expansion_lines(graph, value, names, self._numbers)
         self._function(
             _TAPE_EXPANSION.format(name=f"{name}_expansion"),
-            [*_UNUSED, "(void)jacobian;", *lines],
+            [*unused("xu", lines), "(void)jacobian;", *lines],
             "f0(x, u) and its derivatives by (x, u); those that are zero stay",
         )
         d = n + m

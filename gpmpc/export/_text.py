@@ -1,5 +1,6 @@
 """Numbers, arrays and comments as C text."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
@@ -84,6 +85,12 @@ def split_jacobian(rows: int, n: int, m: int) -> list[str]:
         f"    copy(jacobian + i * {d} + {n}, B + i * {m}, {m});",
         "}",
     ]
+
+
+def unused(arguments: str, lines: Sequence[str]) -> list[str]:
+    """Returns the lines that name those arrays, of a letter each, that others lack."""
+    text = "\n".join(lines)
+    return [f"(void){a};" for a in arguments if not re.search(rf"\b{a}\[", text)]
 
 
 def comment(text: str) -> str:

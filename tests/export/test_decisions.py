@@ -315,6 +315,23 @@ def test_a_failed_step_knows_no_violation():
     assert np.isnan(failed.violation)
 
 
+def test_of_another_controllers_decision_the_input_counts():
+    controller = gpmpc(Problem(WEIGHTS, TORQUES))
+    compiled = CompiledController(controller, compiler=COMPILER)
+    origin = Reference(np.zeros(2))
+    belief = Gaussian.certain([0.3, -0.2])
+    longer = gpmpc(Problem(WEIGHTS, TORQUES), horizon=9).control(belief, origin)
+    own = compiled.control(belief, origin)
+    of_other_bytes = replace(own, memory=b"")  # type: ignore[call-arg]
+    for last in (longer, of_other_bytes):
+        expected = controller.control(belief, origin, last)
+        got = compiled.control(belief, origin, last)
+        assert np.abs(got.inputs - expected.inputs).max() < 1e-9
+        assert got.status is expected.status
+    with pytest.raises(ShapeError, match="input of the last decision"):
+        compiled.control(belief, origin, replace(own, input=np.zeros(2)))
+
+
 def test_states_of_another_size_are_refused():
     compiled = CompiledLoop(gpmpc(Problem(WEIGHTS, TORQUES)), compiler=COMPILER)
     short = Gaussian.certain(np.zeros(1))

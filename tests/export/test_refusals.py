@@ -18,7 +18,13 @@ PROBLEM = Problem(Tracking([1.0, 0.1], [0.05]))
 
 
 def gpmpc(
-    model=GP, propagator=None, problem=PROBLEM, iterations=1, solver=None, **prediction
+    model=GP,
+    propagator=None,
+    problem=PROBLEM,
+    iterations=1,
+    solver=None,
+    budget=None,
+    **prediction,
 ):
     return GPMPC(
         model,
@@ -29,6 +35,7 @@ def gpmpc(
         prediction=PredictionSettings(**prediction),
         iterations=iterations,
         solver=solver,
+        budget=budget,
     )
 
 
@@ -39,6 +46,7 @@ def outside_a_disc(states):
 REFUSED = {
     "controller": lambda: LQR(GP, PROBLEM, 5, [0.0]),
     "iterations": lambda: gpmpc(iterations=None),
+    "budget": lambda: gpmpc(budget=0.01),
     "covariance": lambda: gpmpc(covariance="full"),
     "propagator": lambda: gpmpc(propagator=MomentMatching()),
     "solver": lambda: gpmpc(solver=PrimalActiveSet()),
