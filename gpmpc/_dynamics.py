@@ -292,8 +292,8 @@ def predict_with_jacobian(
     """Predicts, with the derivatives of the mean.
 
     By the model's ``linearize`` where torch follows nothing, neither the arguments nor
-    the model's GPs; else by its own method of this name, which torch can differentiate
-    and transform further, or by autograd.
+    the model's tensors; else by its own method of this name, which torch can
+    differentiate and transform further, or by autograd.
 
     Args:
         model: Has ``predict``.
@@ -301,7 +301,7 @@ def predict_with_jacobian(
         input: (*batch, m).
     """
     arrays = None
-    if hasattr(model, "linearize") and not has_gps_in_graph(model):
+    if hasattr(model, "linearize") and not is_in_graph(model):
         arrays = constant_arrays(state, input)
     if arrays is not None:
         check_query(model, state, input)
@@ -313,16 +313,23 @@ def predict_with_jacobian(
     return FirstOrderExpansion(belief, A, B)
 
 
-def has_gps_in_graph(model: Any) -> bool:
-    """Whether autograd or a function transform follows the GPs of a model.
+def is_in_graph(model: Any) -> bool:
+    """Whether autograd or a function transform follows tensors of a model.
 
-    They are its own, or those of the model that it is made around.
+    They are those of GPs, of an affine nominal model and of an effect B, its own or
+    those of the model that it is made around. What functions hold is not seen.
     """
     weights = getattr(model, "weights", None)
     if isinstance(weights, Tensor):
         return constant_arrays(weights) is None
-    part = getattr(model, "_part", None)
-    return isinstance(part, TensorModel) and has_gps_in_graph(part)
+    nominal = getattr(model, "nominal", None)
+    parts = [getattr(model, "B", None)]
+    parts += [getattr(nominal, name, None) for name in ("A", "B", "c")]
+    tensors = [part for part in parts if isinstance(part, Tensor)]
+    inner = getattr(model, "_part", None)
+    return constant_arrays(*tensors) is None or (
+        isinstance(inner, TensorModel) and is_in_graph(inner)
+    )
 
 
 def _linearize_batch(
@@ -357,7 +364,7 @@ def predict_by_autograd(
         return belief.mean, belief.covariance
 
     (mean, covariance), (A, B) = batched_jacobian(
-        prediction, (state, input), function_in_graph=has_gps_in_graph(model)
+        prediction, (state, input), function_in_graph=is_in_graph(model)
     )
     return FirstOrderExpansion(Gaussian(mean, covariance), A, B)
 

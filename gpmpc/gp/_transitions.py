@@ -359,23 +359,27 @@ def _affixes(label: str, names: Sequence[str]) -> Iterator[tuple[str, str]]:
 
 
 def _check_places(labels: Sequence[str], names: Sequence[str]) -> None:
-    """Raises ``DataError`` where a column names another state than that of its place.
+    """Raises ``DataError`` where columns name all the states in another order.
 
-    A name counts where it is a word of the label: ``x`` in ``x_after``, not in ``max``.
+    A name counts where it is a word of a label: ``x`` in ``x_after``, not in ``max``.
     """
 
-    def holds(label: str, name: str) -> bool:
-        word = rf"(?<![^\W_]){re.escape(name)}(?![^\W_])"
-        return re.search(word, label) is not None
+    def named(label: str) -> str:
+        words = [rf"(?<![^\W_]){re.escape(name)}(?![^\W_])" for name in names]
+        held = [
+            name
+            for name, word in zip(names, words, strict=True)
+            if re.search(word, label)
+        ]
+        return max(held, key=len, default="")
 
-    for label, own_name in zip(labels, names, strict=False):
-        others = [name for name in names if holds(label, name)]
-        if others and not holds(label, own_name):
-            raise DataError(
-                f"next_states: column {label!r} stands in the place of state "
-                f"{own_name!r}; give next states in the order of the states "
-                f"({', '.join(names)})"
-            )
+    order = [named(label) for label in labels]
+    if sorted(order) == sorted(names) and order != list(names):
+        raise DataError(
+            "next_states must stand in the order of the states, or be named as these "
+            f"with one prefix or suffix; got {', '.join(labels)}, states "
+            f"{', '.join(names)}"
+        )
 
 
 def _check_name_list(key: str, names: Any) -> None:

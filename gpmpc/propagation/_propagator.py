@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gpmpc._calls import explains_arguments
-from gpmpc._dynamics import batched_jacobian, check_query, has_gps_in_graph
+from gpmpc._dynamics import batched_jacobian, check_query, is_in_graph
 from gpmpc.exceptions import (
     DataError,
     SettingError,
@@ -237,7 +237,7 @@ def by_autograd(
             belief.covariance.flatten(-2),
             input.expand(*batch, input.shape[-1]),
         ),
-        function_in_graph=has_gps_in_graph(model),
+        function_in_graph=is_in_graph(model),
     )
     _, mean, covariance, cross_covariance, deficit = values
     by_covariance = by_covariance.unflatten(-1, (n, n))

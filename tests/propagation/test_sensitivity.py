@@ -349,6 +349,25 @@ def test_linearised_beliefs_keep_gradients_by_hyperparameters(around):
     assert torch.allclose(gradient[0, 1], numeric, rtol=1e-6, atol=1e-8)
 
 
+def test_linearised_beliefs_keep_gradients_by_a_nominal_model():
+    leaves = [0.3 * draw(2, 2), draw(2, 1), draw(2), draw(2, 1)]
+    for leaf in leaves:
+        leaf.requires_grad_()
+    A, B, c, effect = leaves
+    gp = model(n=1, m=1, predicts="value")
+    at = Gaussian(torch.zeros(2), 0.1 * torch.eye(2))
+    u = torch.ones(1)
+    around = ResidualModel(Affine(A, B, c), gp, effect, [1], [0], 1)
+    for propagator in (Linearization(), MeanEquivalence(), MomentMatching()):
+        after = propagator(around, at, u)
+        total = after.mean.sum() + after.covariance.sum()
+        gradients = torch.autograd.grad(total, leaves, allow_unused=True)
+        has_slope = isinstance(propagator, Linearization | MomentMatching)
+        assert all(gradient is not None for gradient in gradients)
+        assert torch.allclose(gradients[1], u.expand(2, 1))
+        assert has_slope == bool((gradients[0].abs() > 0).any())
+
+
 def test_inference_mode_stops_no_derivative():
     gp = MODELS["next state"]
     at = belief(3)
