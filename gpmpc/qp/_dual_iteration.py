@@ -122,25 +122,16 @@ def iterate(
         must_solve_multipliers = True
         single = not is_first_look and k == size_before
         if single:
-            multiplier_before = work.multiplier[p]
-            attempt = _satisfy_constraint(work, k, p)
-            k = attempt.size
-            iterations += attempt.changes
-            must_solve_multipliers = False
-            if attempt.contradicts:
-                terms = _terms_of_combination(work, k)
-                if _is_contradiction(work, p, terms):
-                    _write_ray(work, k, p)
-                    status = INFEASIBLE
-                    break
-                # pass p over; what it gained on the way belongs to no working set
-                work.multiplier[p] = multiplier_before
-                work.negligible[p] += _ROUNDING_OF_BOUNDS * terms
-                ignore_violations(work, p)
-                passed_over = True
-                # with soft rows ``free_value`` is that of before x_u moved: there
-                # refinement corrects the multipliers
-                must_solve_multipliers = work.soft == 0.0
+            entry = _enter(work, k, p)
+            k = entry.size
+            iterations += entry.changes
+            if entry.infeasible:
+                status = INFEASIBLE
+                break
+            passed_over = passed_over or entry.passed_over
+            # with soft rows ``free_value`` is that of before x_u moved: there
+            # refinement corrects the multipliers
+            must_solve_multipliers = entry.passed_over and work.soft == 0.0
             if work.soft != 0.0:
                 # p may have reached its cap, which moves x_u; several at once need
                 # the ``free_value`` of before
@@ -174,6 +165,44 @@ def iterate(
         batches_left=batches_left,
         violated=violated,
         passed_over=passed_over,
+    )
+
+
+class _Entry(NamedTuple):
+    """What became of a violated constraint."""
+
+    size: int  # of the working set
+    changes: int  # how many constraints entered or left
+    infeasible: bool  # it contradicts the working ones; the ray is written
+    passed_over: bool  # it does by no more than rounding
+
+
+@inline_njit
+def _enter(work, k, p):
+    """Moves to constraint p, which then enters the working set.
+
+    One that contradicts the working ones stays outside: it proves that there is no x,
+    or is passed over where the contradiction may be rounding.
+    """
+    multiplier_before = work.multiplier[p]
+    attempt = _satisfy_constraint(work, k, p)
+    k = attempt.size
+    infeasible = False
+    if attempt.contradicts:
+        terms = _terms_of_combination(work, k)
+        infeasible = _is_contradiction(work, p, terms)
+        if infeasible:
+            _write_ray(work, k, p)
+        else:
+            # what p gained on the way belongs to no working set
+            work.multiplier[p] = multiplier_before
+            work.negligible[p] += _ROUNDING_OF_BOUNDS * terms
+            ignore_violations(work, p)
+    return _Entry(
+        size=k,
+        changes=attempt.changes,
+        infeasible=infeasible,
+        passed_over=attempt.contradicts and not infeasible,
     )
 
 
