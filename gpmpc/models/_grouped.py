@@ -7,7 +7,11 @@ import numpy as np
 
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import SettingError
-from gpmpc.models._parametric import ParametricNominal
+from gpmpc.models._parametric import (
+    ParametricNominal,
+    feedback_outputs,
+    sees_inputs,
+)
 
 
 @dataclass(frozen=True)
@@ -53,14 +57,14 @@ class GroupedNominal:
     @property
     def sees_inputs(self) -> bool:
         """Whether the outputs of any part are functions of the inputs."""
-        return any(part.sees_inputs for part in self.parts)
+        return any(map(sees_inputs, self.parts))
 
     @property
     def feedback_outputs(self) -> tuple[int, ...]:
         """Indices of the outputs that hold the feedback of the controller that flew."""
         indices: list[int] = []
         for part, outputs in zip(self.parts, self.outputs_of, strict=True):
-            indices += [i for i in outputs if i in part.feedback_outputs]
+            indices += set(outputs) & set(feedback_outputs(part))
         return tuple(sorted(indices))
 
     def outputs(

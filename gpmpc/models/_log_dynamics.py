@@ -24,6 +24,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.models._log_linearization import DIFFERENCE, LogLinearizer
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._namings import NO_NAMINGS, Namings
+from gpmpc.models._parametric import sees_inputs
 from gpmpc.models._past import states_along
 from gpmpc.signals import UNKNOWN, Signals
 
@@ -123,7 +124,7 @@ class LogDynamics:
         """Whether any part of the model is a function of the inputs."""
         model = self.model
         learned = bool(model.gps) or bool(model.weights.any())
-        return learned or model.nominal.sees_inputs
+        return learned or sees_inputs(model.nominal)
 
     @property
     def measured_dim(self) -> int:

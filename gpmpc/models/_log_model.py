@@ -26,7 +26,7 @@ from gpmpc.models._actuators import FirstOrderLags
 from gpmpc.models._correction import LAGS, Correction, StartFilter
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._memory import NO_MEMORY, Memory
-from gpmpc.models._parametric import ParametricNominal
+from gpmpc.models._parametric import ParametricNominal, feedback_outputs
 from gpmpc.models._roll_out import iterate
 from gpmpc.models._windows import Windows
 
@@ -126,7 +126,7 @@ class LogModel:
     @property
     def feedback_outputs(self) -> tuple[int, ...]:
         """Indices of the outputs that hold the feedback of the controller that flew."""
-        of_nominal = self.nominal.feedback_outputs
+        of_nominal = feedback_outputs(self.nominal)
         return tuple(i for i in of_nominal if i not in self.without_nominal)
 
     @property

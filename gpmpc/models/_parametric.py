@@ -20,7 +20,11 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 class ParametricNominal(Protocol):
-    """A nominal model of outputs y = f(theta; x, u, c)."""
+    """A nominal model of outputs y = f(theta; x, u, c).
+
+    It may have ``sees_inputs`` and ``feedback_outputs`` as well, which are asked for by
+    functions of these names.
+    """
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -32,21 +36,21 @@ class ParametricNominal(Protocol):
         """Parameters at which a fit begins (P,)."""
         ...
 
-    @property
-    def sees_inputs(self) -> bool:
-        """Whether the outputs are functions of the inputs."""
-        ...
-
-    @property
-    def feedback_outputs(self) -> tuple[int, ...]:
-        """Indices of the outputs that hold the feedback of the controller that flew."""
-        ...
-
     def outputs(
         self, theta: Any, states: Array, inputs: Array, context: Array
     ) -> Array:
         """Computes the outputs (..., o) at states (..., n)."""
         ...
+
+
+def sees_inputs(nominal: ParametricNominal) -> bool:
+    """Returns whether the outputs of a nominal model are functions of the inputs."""
+    return getattr(nominal, "sees_inputs", True)
+
+
+def feedback_outputs(nominal: ParametricNominal) -> tuple[int, ...]:
+    """Returns which outputs hold the feedback of the controller that flew."""
+    return getattr(nominal, "feedback_outputs", ())
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,6 @@ class MultirotorNominal:
     #: at which ``thrust`` and ``torque`` are stated [V]; zero leaves the voltage out
     voltage: float = 0.0
     thrusts: bool = False  #: whether the inputs are thrusts instead of speeds
-    sees_inputs = True
 
     def __post_init__(self) -> None:
         if self.motors < 1:
@@ -161,7 +164,6 @@ class AffineNominal:
     fitted: bool = True  #: otherwise the outputs are zero
     parameter_names = ()
     start = np.empty(0)
-    feedback_outputs = ()
 
     @property
     def sees_inputs(self) -> bool:

@@ -73,8 +73,6 @@ class SystemNominal:
     input_names: tuple[str, ...]  #: of the log (m,)
     fixed: Mapping[str, Any] = field(default_factory=dict)  #: its other arguments
     namings: Namings = NO_NAMINGS  #: other names of these states and inputs
-    sees_inputs = True
-    feedback_outputs = ()
 
     def __post_init__(self) -> None:
         for kind, own, names in (

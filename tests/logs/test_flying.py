@@ -128,6 +128,15 @@ def test_parts_that_all_stand_still_are_named_and_a_known_system_moves():
     )
     assert without_gps(known, space).state_dim == 2
 
+    class Own:  # with no more than the guide asks for
+        parameter_names = ()
+        start = np.empty(0)
+
+        def outputs(self, theta, states, inputs, context):
+            return states + inputs
+
+    assert without_gps(Own(), space).state_dim == 2
+
 
 def test_a_model_with_a_past_has_it_in_its_state():
     space = StateSpace((StateGroup("x", ("x", "y"), ""),))
