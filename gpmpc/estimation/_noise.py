@@ -72,6 +72,8 @@ _FEWEST_ROWS = 10  # that a noise is estimated from
 # difference of two targets at one state and input, in deviations of the noise, up to
 # which they may be of one row
 _SAME_TARGET = 0.1
+_DIGITS = 9  # behind the point, of features that are the same
+_SMALLEST_SCALE = 1e-300  # of a feature
 _LARGEST_RESPONSE = 10.0  # change of a working response by one residual, at most
 
 
@@ -335,11 +337,12 @@ def _rows_and_points(trained: "_TrainedGP", errors: Tensor) -> Tensor:
     # (N, k, k), by which the errors of points show in those of a row.
     visible = to_array(inverse @ trained.effect / deviations[:, None])
     of_points = to_array(trained.errors_of_points)
+    scale = gp.features.abs().amax(dim=0).clamp_min(_SMALLEST_SCALE)
     points_at = defaultdict(list)
-    for point, features in enumerate(gp.features.tolist()):
+    for point, features in enumerate(_rounded(gp.features / scale)):
         points_at[tuple(features)].append(point)
     pairs = []
-    for row, features in enumerate(trained.features.tolist()):
+    for row, features in enumerate(_rounded(trained.features / scale)):
         candidates = points_at[tuple(features)]
         if not candidates:
             continue
@@ -350,6 +353,14 @@ def _rows_and_points(trained: "_TrainedGP", errors: Tensor) -> Tensor:
             pairs.append((row, candidates.pop(nearest)))
     device = errors.device
     return torch.tensor(pairs, dtype=torch.long, device=device).reshape(-1, 2)
+
+
+def _rounded(features: Tensor) -> list[list[float]]:
+    """Rounds features (N, d) of about one, which round-off then leaves the same.
+
+    A mean of two inputs, as a fractional delay has it, is not the same to the bit.
+    """
+    return features.round(decimals=_DIGITS).tolist()
 
 
 class _TrainedGP(NamedTuple):

@@ -37,9 +37,9 @@ class DelayedModel(LinearWrapper):
 
     and the other inputs move on by a place. The model inside is trained on the inputs
     that acted (``transitions``): one of rows as they were recorded would be late twice.
-    A controller plans with it, or, with fewer
-    states, with the undelayed model from the state to which the pending inputs will
-    have led (``ahead``; the prediction of Smith, 1957, in state space).
+    A controller plans with it, or, with fewer states, with the undelayed model from the
+    state to which the pending inputs will have led (``ahead``; the prediction of Smith,
+    1957, in state space).
 
     Raises:
         SettingError: The delay is no positive number, or the model does not predict

@@ -363,28 +363,17 @@ def test_misuse_is_refused():
         estimate_delay(np.where(states > 1, np.nan, states) * np.nan, inputs)
 
 
-def late(data, delay):
-    """Rows of (x, u_{k-1}, ..), whose inputs act late, and those that acted."""
-    inputs = torch.zeros(len(data) + delay, 1)
-    inputs[delay:] = data.inputs
-    acting = inputs[: len(data)]
-    queue = [inputs[i : i + len(data)] for i in range(delay)]
-    moved = [inputs[i + 1 : i + 1 + len(data)] for i in range(delay)]
-    states = torch.cat([data.states, *queue], dim=1)
-    after = torch.cat([data.next_states, *moved], dim=1)
-    return (
-        Transitions(states, data.inputs, after),
-        Transitions(data.states, acting, data.next_states),
-    )
-
-
-def test_rows_of_a_model_inside_of_others_are_left_out_as_well():
-    whole, inner = late(transitions(*log(60, 2, 3, std=(2e-3, 0.03))), 2)
+@pytest.mark.parametrize("delay", [2, 1.3])
+def test_rows_of_a_model_inside_of_others_are_left_out_as_well(delay):
+    states, inputs = log(62, 2, 3, std=(2e-3, 0.03))
+    inner = DelayedModel.transitions(states, inputs, delay)
     model = Trainer(predicts="difference", restarts=0)(inner).posterior
     expected = estimate_process_noise(model, inner).variance
-    delayed = DelayedModel(model, 2)
+    delayed = DelayedModel(model, delay)
+    rows = np.column_stack([states[2:], inputs[:-1], inputs[1:]])
+    whole = transitions(rows, inputs[2:])
     variance = estimate_process_noise(delayed, whole).variance
-    assert torch.allclose(variance[:2], expected, rtol=1e-9)
+    assert torch.allclose(variance[:2], expected, rtol=1e-6)
     assert not variance[2:].any()
     g = replace(model, predicts="value")
     noisy = NoisyModel(model, g, [0, 1])
