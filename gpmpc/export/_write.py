@@ -48,6 +48,7 @@ _AROUND = {
     "CMakeLists.txt": "CMakeLists.txt",
     "library.properties": "library.properties",
     "examples/replay/replay.c": "replay.c",
+    "examples/step_time/step_time.ino": "step_time.ino",
     "ros2/node.cpp": "ros2_node.cpp",
     "ros2/CMakeLists.txt": "ros2_CMakeLists.txt",
     "ros2/package.xml": "ros2_package.xml",

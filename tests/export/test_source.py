@@ -99,6 +99,24 @@ def test_two_controllers_of_one_program_have_names(tmp_path):
     subprocess.run(["./both"], cwd=tmp_path, check=True)
 
 
+BOARD = """
+    #pragma once
+    struct Port { void begin(long); void println(unsigned long); };
+    extern Port Serial;
+    unsigned long micros();
+    void delay(unsigned long);
+"""
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
+def test_the_sketch_of_a_board_is_cpp(tmp_path):
+    export_c(controller_of(), tmp_path, name="arm")
+    (tmp_path / "board.h").write_text(BOARD)
+    command = ["c++", "-std=c++11", "-fsyntax-only", "-Wall", "-Wextra", "-Werror"]
+    sketch = ["-include", "board.h", "-x", "c++", "examples/step_time/step_time.ino"]
+    subprocess.run([*command, "-Isrc", *sketch], cwd=tmp_path, check=True)
+
+
 def test_names_of_signals_end_no_comment(tmp_path):
     names = ["*/ int x;", "\u202e\n #error ??/"]
     gp = replace(pendulum_posterior(), signals=Signals(names, ["float"], 0.2))

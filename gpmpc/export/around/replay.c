@@ -39,9 +39,10 @@ int main(int count, char **arguments)
     int steps = 0;
     int other_statuses = 0;
     int expected_status;
-    FILE *file = fopen(count > 1 ? arguments[1] : "replay.txt", "r");
+    const char *name = count > 1 ? arguments[1] : "replay.txt";
+    FILE *file = fopen(name, "r");
     if (!file) {
-        fprintf(stderr, "there is no such file\n");
+        fprintf(stderr, "%s cannot be read; write_replay of Python writes it\n", name);
         return 2;
     }
     gpmpc_reset(&controller);
