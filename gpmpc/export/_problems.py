@@ -88,14 +88,14 @@ def needs_means_alone(controller: GPMPC) -> bool:
     It is where plans are rolled out, and where a disturbance is estimated.
     """
     prediction = controller.prediction
-    if prediction.rolls_out or prediction.constraints.gives_way:
+    if prediction.rolls_out or prediction.constraints.any_elastic:
         return True
     return prediction.settings.disturbance_gain > 0
 
 
 def _kappas(controller: GPMPC) -> Array:
     """Returns the deviations between means and sides (r,)."""
-    return controller.prediction.constraints.margins[0]
+    return controller.prediction.constraints.kappas[0]
 
 
 def definitions(
@@ -151,7 +151,7 @@ def _flags(controller: GPMPC, numbers: Numbers, on_failure: str) -> dict[str, bo
         "GPMPC_IS_FLOAT": numbers.precision == "float",
         "GPMPC_HAS_RATES": controller.problem.input_rates.finite,
         "GPMPC_SOFT": constraints.soft,
-        "GPMPC_ELASTIC": constraints.gives_way,
+        "GPMPC_ELASTIC": constraints.any_elastic,
         "GPMPC_SMOOTH": constraints.smooth,
         "GPMPC_OUTPUTS": bool(controller.problem.outputs),
         "GPMPC_TUBES": tightens(controller),
@@ -200,7 +200,7 @@ def _optional_tables(controller: GPMPC, numbers: Numbers) -> list[str]:
     if scales is not None:
         note = "of the states in the data (n,)"
         parts.append(numbers.table("data_ranges", scales.ranges, note))
-    if constraints.gives_way:
+    if constraints.any_elastic:
         elastic = constraints.elastic.tolist()
         parts.append(integers("row_is_elastic", elastic, "rows that give way"))
     if constraints.smooth:

@@ -1249,10 +1249,10 @@ typedef struct {
    and violations V0 of the plan without them,
    least price = 2 (J + ..) / V0,   J0 <= J <= 2 J0,   extra cost = (J0 + ..) / 10 */
 static elastic_limits limits_of_price(const gpmpc_problem *problem, const real *misses,
-                                      real free_cost, real last_cost, real exact_price)
+                                      real free_cost, real guess_cost, real exact_price)
 {
     elastic_limits limits;
-    real cost = smaller(larger(free_cost, last_cost), 2 * free_cost);
+    real cost = smaller(larger(free_cost, guess_cost), 2 * free_cost);
     real sum_of_misses = 0;
     real beside = 0;
     real price;
@@ -1359,7 +1359,7 @@ static void solve_elastic(gpmpc_controller *controller)
     real misses[GPMPC_STATE_ROWS];
     real inputs[GPMPC_SIZE];
     real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
-    real last_cost, affordable_cost;
+    real guess_cost, affordable_cost;
     real highest = 0; /* price */
     int e;
     if (solution->status != GPMPC_SOLVED)
@@ -1370,7 +1370,7 @@ static void solve_elastic(gpmpc_controller *controller)
     for (e = 0; e < r; e++)
         if (row_is_elastic[e])
             highest = larger(highest, problem->prices[e]);
-    last_cost = cost_of_plan(problem, &problem->states[0][0], &problem->inputs[0][0]);
+    guess_cost = cost_of_plan(problem, &problem->states[0][0], &problem->inputs[0][0]);
     set_elastic_price(problem, NO_PRICE);
     solve(problem, &controller->program, solution, without);
     if (without->status != GPMPC_SOLVED) {
@@ -1380,7 +1380,7 @@ static void solve_elastic(gpmpc_controller *controller)
     expand(problem, without->x, inputs, states);
     write_misses(problem, without, misses);
     limits = limits_of_price(problem, misses, cost_of_plan(problem, states, inputs),
-                             last_cost, highest);
+                             guess_cost, highest);
     if (!problem->has_feedback)
         write_gains(problem);
     affordable_cost = INFINITY;

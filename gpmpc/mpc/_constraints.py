@@ -52,15 +52,15 @@ class ConstraintRows:
         soft: Whether a violation of any has a price.
         prices: Of the rows (r,), infinite where they are hard.
         elastic: Whether a row gives way where it cannot be kept (r,).
-        gives_way: Whether any does.
+        any_elastic: Whether any does.
         signs: 1 where a row has upper bounds, -1 where it has lower ones (r,).
         applies: Whether a row has a bound at a stage (H, r).
         smooth: Whether there is any ``Inequality``.
         smooth_rows: These, and the columns of their rows.
         per_stage: r.
         linear: The rows as they are declared, untightened.
-        margins: Deviations that bounds move inwards by (H, r): kappa in the mode
-            ``zero_order``, else zero.
+        kappas: Deviations that bounds move inwards by (H, r): those declared in the
+            mode ``zero_order``, else zero.
     """
 
     def __init__(self, problem: Problem, horizon: int, covariance: Covariance):
@@ -73,20 +73,20 @@ class ConstraintRows:
         self.smooth_rows = _find_smooth(problem.constraints, parts)
         self.prices = rows.prices
         self.elastic = rows.elastic
-        self.gives_way = bool(rows.elastic.any())
+        self.any_elastic = bool(rows.elastic.any())
         self.signs = np.where(np.isfinite(rows.upper).any(axis=0), 1.0, -1.0)
         self.applies = np.isfinite(rows.lower) | np.isfinite(rows.upper)
         self.per_stage = len(rows.kappa)
         self.soft = bool(np.isfinite(rows.prices).any())
         self.smooth = bool(self.smooth_rows)
-        margins = rows.kappa if covariance == "zero_order" else np.zeros(self.per_stage)
-        self.margins = np.tile(margins, (horizon, 1))
+        kappas = rows.kappa if covariance == "zero_order" else np.zeros(self.per_stage)
+        self.kappas = np.tile(kappas, (horizon, 1))
         self._covariance: Covariance = covariance
         self._signed_kappa = self.signs * rows.kappa
         self._no_inputs = np.zeros((0, 0, problem.input_dim))
         holds_covariance = self.per_stage > 0 and covariance in ("full", "diagonal")
         self._fixed: StageRows | None = None
-        if not (self.smooth or margins.any() or holds_covariance):
+        if not (self.smooth or kappas.any() or holds_covariance):
             self._fixed = self._rows_that_stay()
 
     def _rows_that_stay(self) -> StageRows:
@@ -102,7 +102,7 @@ class ConstraintRows:
         self,
         plan: Plan,
         covariances: Array,
-        stages: int,
+        stage_count: int,
         parameters: Array | None = None,
         kappas: Array | None = None,
     ) -> StageRows:
@@ -111,7 +111,7 @@ class ConstraintRows:
         Args:
             plan: Where smooth constraints are linearised.
             covariances: Of the states (H + 1, n, n).
-            stages: Number of stage models, H or 1.
+            stage_count: Of stage models, H or 1.
             parameters: Of smooth constraints by stage (H, q).
             kappas: By stage (H,), in the place of those of the constraints.
         """
@@ -123,12 +123,12 @@ class ConstraintRows:
         D = self._no_inputs
         if self.smooth:
             F, D = self._linearize_smooth(plan, parameters, upper)
-        margins = self.margins
+        row_kappas = self.kappas
         if kappas is not None:
-            margins = np.where(self.margins > 0, kappas[:, None], 0.0)
-        _tighten.unchecked(F, margins, covariances, lower, upper)
+            row_kappas = np.where(self.kappas > 0, kappas[:, None], 0.0)
+        _tighten.unchecked(F, row_kappas, covariances, lower, upper)
         E = _by_belief(
-            F, covariances[1 : stages + 1], self._covariance, self._signed_kappa
+            F, covariances[1 : stage_count + 1], self._covariance, self._signed_kappa
         )
         return StageRows(np.ascontiguousarray(E), D, lower, upper)
 

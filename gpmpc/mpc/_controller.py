@@ -345,8 +345,18 @@ class Request(NamedTuple):
     kappas: Array | None = None  # of the reference (H,), where it has some
     #: the last decision, where its plan may be started from and has this horizon
     previous: Decision | None = None
-    #: a first guess of x_0 .. x_H (H + 1, n), where one was handed over
+    #: a first guess of x_0 .. x_H (H + 1, n), where states or inputs were handed over
     guessed_states: Array | None = None
+
+    @property
+    def continues_last_plan(self) -> bool:
+        """Whether the first guess is the last plan, one step on."""
+        return self.previous is not None and self.guessed_states is None
+
+    @property
+    def starts_afresh(self) -> bool:
+        """Whether there is neither a last plan nor one that was handed over."""
+        return self.previous is None and self.guessed_states is None
 
     @classmethod
     def read(

@@ -74,7 +74,7 @@ class ElasticLimits(NamedTuple):
 def elastic_limits(
     local: LocalProblem,
     free_cost: float,
-    last_cost: float,
+    guess_cost: float,
     elastic: Array,
     Q: Array,
     largest_weight: float,
@@ -84,7 +84,7 @@ def elastic_limits(
     Args:
         local: With the plan that minimises the cost alone.
         free_cost: Of that plan, J0.
-        last_cost: Of the last plan.
+        guess_cost: Of the first guess, such as the last plan.
         elastic: Which of the r rows are elastic (r,).
         Q: Weight of the states (n, n), or of those of each stage (H, n, n).
         largest_weight: Of the whole cost, which counts where Q is zero.
@@ -103,7 +103,7 @@ def elastic_limits(
     # The cheapest move by a violation v along a gradient g has the size v / |g|.
     moving_costs = weights / np.maximum(squares, _TINY) ** 2 * missed**2
     moving_cost = moving_costs.sum()
-    cost = min(max(free_cost, last_cost), 2.0 * free_cost) + moving_cost
+    cost = min(max(free_cost, guess_cost), 2.0 * free_cost) + moving_cost
     least_price = max(WORTH * cost / max(missed.sum(), _TINY), NO_PRICE)
     return ElasticLimits(
         least_price=_rounded(least_price),

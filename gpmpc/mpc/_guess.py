@@ -156,8 +156,7 @@ def _guess_inputs(prediction: PredictionModel, request: Request) -> Array:
     """Returns the inputs of the first plan (H, m), within bounds and rates."""
     problem = prediction.problem
     inputs = request.guessed_inputs
-    is_first = request.previous is None and request.guessed_states is None
-    if is_first and problem.cost.penalized == "deviations":
+    if request.starts_afresh and problem.cost.penalized == "deviations":
         bounds = problem.inputs
         inputs = request.references.inputs.clip(bounds.lower, bounds.upper)
     if problem.input_rates.finite:

@@ -326,7 +326,8 @@ class PredictionModel:
     def gains(self, A: Array, B: Array, cost: QuadraticCost) -> Array:
         """Returns K_0 .. K_{H-1} (H, m, n) of the feedback u = u_k - K_k (x - mu_k).
 
-        They are weighed as at the first stage, and zero without feedback.
+        They are weighed by Q and R of the first stage and by the weight of the last
+        one, and zero without feedback.
         """
         n = self.state_dim
         if not self.settings.feedback:
@@ -596,7 +597,8 @@ class StageCosts:
             axis=0,
         )
         weights = self._linearizer.weight(self._Q + squares[:, :n, :n])
-        weights[:, 0] = self._Q  # of the mean, which the squares weigh themselves
+        # The squares weigh the mean already; the weights add what spreads cost.
+        weights[:, 0] = self._Q
         return self.quadratic._replace(
             state=weights, terminal=weights[-1], squares=squares
         )

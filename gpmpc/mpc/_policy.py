@@ -11,8 +11,8 @@ LQR: name it in ``OnFailure``, which ``check_policy`` and the settings of loops 
 studies read; choose its input in ``_conclude``, beside ``_continue_last_plan``, which
 also holds inputs for ``"hold"``; and tell of it in ``decide`` and ``ControlLoop``. A
 ``Command`` holds the last plan alone: what a policy counts or remembers is to be a
-field of it. A policy that asks another controller needs the belief, which ``decide``
-has and ``_conclude`` is to be given, and the controller, beside the name.
+field of it. A policy that asks another controller needs that beside the name; what is
+known of the state is ``situation.belief``.
 """
 
 from collections.abc import Sequence

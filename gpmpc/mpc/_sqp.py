@@ -346,8 +346,8 @@ class Globalization:
         """
         progress = self._progress
         request = self._request
-        continued = request.previous is not None and request.guessed_states is None
-        far = progress.size > _NEAR and not (progress.is_first and continued)
+        goes_on = progress.is_first and request.continues_last_plan
+        far = progress.size > _NEAR and not goes_on
         matches_moments = self._prediction.linearizer.depends_on_covariance
         return matches_moments or progress.creeps or far
 

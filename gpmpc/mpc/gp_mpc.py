@@ -269,10 +269,10 @@ class GPMPC:
                 guess = initial_guess(self.prediction, request)
                 local = self.prediction.linearize(guess, request)
             local = self._at_a_motion(local, request)
-            is_first = request.previous is None and request.guessed_states is None
             number_is_open = self.iterations is None and self._most_programs > 1
             # A curved bound lies elsewhere than one program sees it.
-            if is_first and number_is_open and not self.prediction.constraints.smooth:
+            may_be_thorough = number_is_open and not self.prediction.constraints.smooth
+            if request.starts_afresh and may_be_thorough:
                 return self._decide_first(local, request, stopwatch)
             return self._improve(local, request, stopwatch, self._most_programs)
         except FAILURES as error:
@@ -319,7 +319,7 @@ class GPMPC:
         linearizer = self.prediction.linearizer
         if linearizer.depends_on_covariance or not quick.applicable:
             return quick
-        if self._is_late(stopwatch):
+        if self.is_late(stopwatch):
             return quick
         try:
             thorough = self._improve(local, request, stopwatch, self._most_programs)
@@ -338,7 +338,7 @@ class GPMPC:
         quick_cost = cost_of_inputs(self.prediction, quick.inputs, request)
         return thorough_cost < _PAYS * quick_cost
 
-    def _is_late(self, stopwatch: Stopwatch) -> bool:
+    def is_late(self, stopwatch: Stopwatch) -> bool:
         """Returns whether a decision has spent its budget."""
         return self.budget is not None and stopwatch.elapsed > self.budget
 
@@ -535,8 +535,8 @@ class _ControlStep:
     @property
     def _may_go_on(self) -> bool:
         """Whether one more program may be solved."""
-        is_late = self._controller._is_late(self._stopwatch)
-        return self._programs < self._most_programs and not is_late
+        late = self._controller.is_late(self._stopwatch)
+        return self._programs < self._most_programs and not late
 
     @property
     def _limit(self) -> Status:
@@ -568,7 +568,7 @@ class _ControlStep:
         solution = self._solve_priced(program, self._warm_start, self._row_prices)
         constraints = self._prediction.constraints
         is_first = self._programs == 0
-        if is_first and constraints.gives_way and solution.status.solved:
+        if is_first and constraints.any_elastic and solution.status.solved:
             planned = self._planned(program, solution, local)
             if violations(planned, constraints.elastic).max() > KEPT:
                 solution = self._solve_elastic(program, solution, local)
@@ -628,7 +628,7 @@ class _ControlStep:
         limits = elastic_limits(
             free,
             free_cost=float(free.stage_costs(references).sum()),
-            last_cost=float(local.stage_costs(references).sum()),
+            guess_cost=float(local.stage_costs(references).sum()),
             elastic=elastic,
             Q=self._prediction.problem.cost.Q,
             largest_weight=exact_price / EXACT,
@@ -665,7 +665,7 @@ class _ControlStep:
         price = min(least_price, highest_price)
         best = None
         for _ in range(TRIALS):
-            if self._controller._is_late(self._stopwatch):
+            if self._controller.is_late(self._stopwatch):
                 break
             middle = math.sqrt(price * highest_price)
             prices[elastic] = middle
@@ -822,8 +822,8 @@ class _ControlStep:
                 return self._failed_decision(solution, status)
         violation = self._violation(local)
         constraints = self._prediction.constraints
-        gives_way = constraints.soft or constraints.smooth
-        if gives_way and status is Status.SOLVED and violation > KEPT:
+        may_be_missed = constraints.soft or constraints.smooth
+        if may_be_missed and status is Status.SOLVED and violation > KEPT:
             status = Status.SOFT_BOUND_MISSED
         means, covariances = self._prediction.linearizer.moments(
             plan.states, local.covariances
