@@ -16,6 +16,11 @@ from gpmpc.exceptions import DataError
 
 Array = NDArray[np.float64]
 
+#: Size from which on a number was not measured: with the largest numbers of their type
+#: (3.4e38, 1.8e308) and the infinite ones sensors mark what they did not see. One that
+#: was planned from would leave the plans after it no digits.
+UNMEASURED = 1e30
+
 _RULE = "must be real numbers"
 _TOPIC = re.compile(r"^(state|measured|input)\.")
 
@@ -58,6 +63,11 @@ def read_array(
         array = sorted_columns(key, array, labels, names)
     array = np.asarray(array, dtype=np.float64)
     return array if array.flags.writeable else array.copy()  # torch wants to write
+
+
+def is_measured(values: Array) -> NDArray[np.bool_]:
+    """Tells which numbers were measured: not NaN, nor ``UNMEASURED`` or more in size."""
+    return np.abs(values) < UNMEASURED
 
 
 def sorted_columns(

@@ -27,7 +27,7 @@ import torch
 from torch import Tensor
 
 from gpmpc._angles import state_difference
-from gpmpc._arrays import read_array
+from gpmpc._arrays import UNMEASURED, read_array
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import (
     Array,
@@ -304,7 +304,8 @@ class KalmanFilter:
     def update(self, belief: Gaussian, measured: Any) -> Update:
         """Corrects a belief (*batch, n) by a measurement y (*batch, p).
 
-        Entries of y that are not finite are missing.
+        Entries of y that are not finite, or 1e30 or more in size, are missing: marks of
+        sensors that saw nothing.
 
         Raises:
             ShapeError: y has another number of entries.
@@ -314,7 +315,7 @@ class KalmanFilter:
         y = self._as_measurement(belief, measured)
         R = self.measurement.noise_covariance
         view = self._view(belief)
-        missing = ~torch.isfinite(y)
+        missing = ~(y.abs() < UNMEASURED)
         innovation = state_difference(y, view.mean, self.measurement.angles)
         # A missing entry shows nothing, with a noise that is independent of others.
         unrelated = missing[..., None] | missing[..., None, :]

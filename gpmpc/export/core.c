@@ -25,6 +25,18 @@ static real absolute(real a) { return a < 0 ? -a : a; }
 
 static int is_finite(real a) { return a - a == 0; }
 
+/* Sensors mark with the largest numbers of their type what they did not see. */
+static int is_measured(real a) { return absolute(a) < (real)1e30; }
+
+static int all_measured(const real *x, int size)
+{
+    int i;
+    for (i = 0; i < size; i++)
+        if (!is_measured(x[i]))
+            return 0;
+    return 1;
+}
+
 static int all_finite(const real *x, int size)
 {
     int i;
@@ -1660,7 +1672,7 @@ int gpmpc_step_belief(gpmpc_controller *controller, const gpmpc_real mean[GPMPC_
     int status = GPMPC_INVALID_MEASUREMENT;
     real disturbance[GPMPC_STATES];
     copy(controller->disturbance, disturbance, n);
-    if (all_finite(mean, n) && all_finite(covariance, n * n))
+    if (all_measured(mean, n) && all_finite(covariance, n * n))
         status = decide(controller, mean, covariance, reference, &applicable);
     if (applicable && !take_plan(controller)) {
         applicable = 0;

@@ -22,7 +22,7 @@ enum gpmpc_status {
     GPMPC_ITERATION_LIMIT,      /* the quadratic program took too many changes */
     GPMPC_TIME_LIMIT,           /* never: a step knows no clock */
     GPMPC_NUMERICAL_TROUBLE,    /* the digits did not suffice, or were not finite */
-    GPMPC_INVALID_MEASUREMENT,  /* what was measured is not finite */
+    GPMPC_INVALID_MEASUREMENT,  /* what was measured is not finite, or >= 1e30 */
     GPMPC_FUNCTION_NOT_FINITE,  /* a constraint or an output is not */
     GPMPC_SOFT_BOUND_MISSED,    /* solved, but a soft bound is missed */
     GPMPC_STALLED               /* never: a step takes one program */
@@ -220,8 +220,8 @@ void gpmpc_hold(gpmpc_reference *reference, const gpmpc_real state[GPMPC_STATES]
 
 /* Decides the input of a time step. Without a filter what is measured is the state (n),
    which counts as certain. With one (GPMPC_FILTERS) it is what sensors show: entries
-   that are not finite are missing, and the last step's input counts as applied; where
-   another one was, write it to controller.input before. */
+   that are not finite, or 1e30 or more in size, are missing, and the last step's input
+   counts as applied; where another one was, write it to controller.input before. */
 int gpmpc_step(gpmpc_controller *controller,
                const gpmpc_real measured[GPMPC_MEASURED],
                const gpmpc_reference *reference, gpmpc_real input[GPMPC_INPUTS]);

@@ -114,7 +114,7 @@ static void read_sensors(const gpmpc_belief *belief, const real *measured,
     measurement(belief->mean, expected, slopes);
     product(slopes, update->root[MEASURED], MEASURED, n, n, update->root[0]);
     for (i = 0; i < MEASURED; i++) {
-        update->is_missing[i] = !is_finite(measured[i]);
+        update->is_missing[i] = !is_measured(measured[i]);
         update->innovation[i] = measured[i] - expected[i];
         for (a = 0; a < GPMPC_MEASURED_ANGLE_COUNT; a++)
             if (measured_angles[a] == i && !update->is_missing[i])

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc._arrays import is_measured
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, to_array
 from gpmpc.exceptions import DataError, SettingError, check_kind, check_method
@@ -95,7 +96,7 @@ class LearningController:
         learned = None if previous is None else previous.learned
         if previous is None or learned is None:
             return LearningState.begin(self._model, measured)
-        if not np.isfinite(measured).all():
+        if not is_measured(measured).all():
             return learned.later()
         if not np.array_equal(previous.means[0], learned.state):
             return learned.after_gap(measured)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from gpmpc._arrays import is_measured
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import check_number
 from gpmpc.gp import Transitions
@@ -36,7 +37,7 @@ class EpisodicLearning:
         data.signals.check(
             "the data", Signals(time_step=flight.time_step), "the flight"
         )
-        measured = np.all(np.isfinite(flight.measured), axis=1)
+        measured = np.all(is_measured(flight.measured), axis=1)
         rows = np.flatnonzero(np.logical_and(measured[:-1], measured[1:]))
         states = torch.from_numpy(flight.measured[rows])
         inputs = torch.from_numpy(flight.inputs[rows])

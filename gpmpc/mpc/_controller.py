@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from gpmpc._angles import full_turns
-from gpmpc._arrays import names_of, read_array, sorted_columns
+from gpmpc._arrays import UNMEASURED, names_of, read_array, sorted_columns
 from gpmpc._calls import explains_arguments
 from gpmpc._compiled import compiled
 from gpmpc.exceptions import (
@@ -337,7 +337,8 @@ class Request(NamedTuple):
     #: inputs (H, m) within their bounds: those handed over; else the last plan's, one
     #: step on, the last one repeated; else the previous input repeated
     guessed_inputs: Array
-    #: whether the belief is; one that is not is a bad measurement, not misuse
+    #: whether the belief is, and was measured; one that is not is a bad measurement,
+    #: not misuse
     finite: bool
     #: added to the model's mean at every stage (n,); None where nothing is estimated
     disturbance: Array | None = None
@@ -404,7 +405,7 @@ class Request(NamedTuple):
         m = problem.cost.R.shape[-1]
         state = _as_array(belief.mean)
         covariance = _as_array(belief.covariance)
-        finite = _is_finite(state) and _is_finite(covariance)
+        finite = is_usable(state, covariance)
         targets = _read_targets(reference, state, horizon, n)
         if reference.inputs is None and problem.cost.penalized == "deviations":
             rule = f"needs reference inputs ({horizon}, {m})"
@@ -670,12 +671,29 @@ def _unwrap(
     return targets + full_turns(plan - targets, angles)
 
 
+def is_usable(mean: Array, covariance: Array) -> bool:
+    """Tells whether a belief can be decided on: mean (n,) and covariance (n, n).
+
+    It is finite, and its mean was measured (``gpmpc._arrays.UNMEASURED``).
+    """
+    return _all_measured.unchecked(mean.ravel()) and _is_finite(covariance)
+
+
 def _is_finite(values: Array) -> bool:
     """Returns whether all numbers of a contiguous array are finite.
 
     NumPy takes 2 us for it, of which a control step would pay five times.
     """
     return _all_finite.unchecked(values.ravel())
+
+
+@compiled(locked=True)
+def _all_measured(values):
+    """Returns whether all numbers (d,) are measured ones."""
+    count = 0
+    for value in values:
+        count += abs(value) < UNMEASURED
+    return count == len(values)
 
 
 @compiled(locked=True)

@@ -8,8 +8,8 @@ for is told in ``_judgement``.
 
 A measurement that is missing is NaN. It is no innovation, it tells nothing of its
 sensor, and the plant counts as where the last plan predicted it. Numbers beyond
-``LARGEST`` count as missing, in measurements and in plans: their squares are none, and
-one of them would stay in the sums of windows.
+``UNMEASURED`` count as missing, in measurements and in plans: their squares may be
+none, and one of them would stay in the sums of windows.
 """
 
 import math
@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
+from gpmpc._arrays import UNMEASURED
 from gpmpc._compiled import compiled, njit_noalloc
 
 Array = np.ndarray
@@ -45,7 +46,6 @@ _VIOLATED = 1e-6  # violation of a constraint from which on it counts as missed
 _CLIMBED = 0.1  # of its first cost, from which on plans that cost ever more count
 _RISEN = 2.0  # of its first cost, from which on they are lost
 _ROUNDING = 1e-9
-LARGEST = 1e100  # size of a number from which on it is no measurement and no plan
 _MEDIAN = 0.455  # of a chi-square of one degree
 
 # Why a step is not healthy.
@@ -203,7 +203,7 @@ def all_usual(values):
     """Returns whether all numbers (d,) are such as are measured and planned."""
     count = 0
     for value in values:
-        count += abs(value) < LARGEST
+        count += abs(value) < UNMEASURED
     return count == len(values)
 
 

@@ -30,6 +30,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from gpmpc._arrays import is_measured
 from gpmpc._dynamics import to_array
 from gpmpc.exceptions import ShapeError, UnsupportedModel
 from gpmpc.mpc import _flight_checks as checks
@@ -311,7 +312,7 @@ def _usual(values: Any) -> Array:
     """
     if checks.all_usual.unchecked(values.ravel()):
         return values
-    return np.where(np.abs(values) < checks.LARGEST, values, np.nan)
+    return np.where(is_measured(values), values, np.nan)
 
 
 # The words for plans that cost more again, but less than the first one still.

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gpmpc._arrays import is_measured
 from gpmpc._dynamics import Array, linearize, to_array
 from gpmpc.gaussian import Gaussian
 from gpmpc.models._past import ModelWithPast, belief_of_all, has_past
@@ -65,9 +66,9 @@ class Situation:
             unknown = np.full(model.state_dim, np.nan)
             reference = _reference_of_all(reference, np.zeros_like(unknown), n)
             return cls(Gaussian.certain(unknown), reference, measured_dim=n)
-        is_measured = np.isfinite(measured).all()
+        is_known = is_measured(measured).all()
         return cls(
-            belief=belief_of_all(belief, state if is_measured else np.nan * state),
+            belief=belief_of_all(belief, state if is_known else np.nan * state),
             reference=_reference_of_all(reference, state, n),
             state=state,
             measured_dim=n,
@@ -92,10 +93,10 @@ def _state(
     last_input: Array,
 ) -> Array | None:
     """Returns the state (n,) of now; None where nothing is known of it."""
-    is_measured = np.isfinite(measured).all()
+    is_known = is_measured(measured).all()
     if last_state is None:
-        return model.at_rest(measured, last_input) if is_measured else None
-    if not is_measured:
+        return model.at_rest(measured, last_input) if is_known else None
+    if not is_known:
         local = linearize(model, last_state[None], last_input[None], covariance=False)
         return local.mean[0]
     return model.follow(last_state, last_input, measured)

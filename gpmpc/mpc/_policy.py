@@ -21,11 +21,10 @@ from inspect import Parameter, signature
 from typing import Any, Literal, get_args
 
 import numpy as np
-import torch
 from scipy.interpolate import krogh_interpolate
 
 from gpmpc._angles import full_turns
-from gpmpc._arrays import read_array
+from gpmpc._arrays import is_measured, read_array
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import to_array
 from gpmpc.exceptions import (
@@ -42,6 +41,7 @@ from gpmpc.mpc._controller import (
     Decision,
     Reference,
     Timing,
+    is_usable,
     one_step_on,
     read_reference,
 )
@@ -102,7 +102,8 @@ def decide(
     within its input and rate bounds.
 
     Args:
-        controller: It is called where the belief is finite.
+        controller: It is called where the belief is finite and below 1e30 in size;
+            beyond are marks of sensors that saw nothing, such as 3.4e38.
         belief: What is known of the state.
         reference: Over the horizon, or a set point.
         last: Command of the step before; None at the first.
@@ -123,7 +124,7 @@ def decide(
         options["plan"] = plan
     situation = _situation(controller, belief, reference, last)
     decision = None
-    if _is_finite(situation.belief):
+    if _is_usable(situation.belief):
         previous = None if last is None else last.plan
         decision = _control(
             controller, situation.belief, situation.reference, previous, options
@@ -187,7 +188,7 @@ def decide_many(
         _situation(controller, belief, reference, command)
         for belief, command in zip(beliefs, last, strict=True)
     ]
-    finite = [i for i, one in enumerate(situations) if _is_finite(one.belief)]
+    finite = [i for i, one in enumerate(situations) if _is_usable(one.belief)]
     plans = [None if command is None else command.plan for command in last]
     if len(beliefs) == 1 or not _decides_together(controller):
         decided = [
@@ -240,9 +241,9 @@ class ControlLoop:
 
     It holds what one step needs of the last. What ``input`` returns is finite, and
     within the bounds and rates of the controller's problem, whatever happened: a
-    measurement that is not finite, a program without a solution, an error of the
-    numbers. Before the first plan that is the reference's input, or the controller's
-    initial one.
+    measurement that is not finite or 1e30 or more in size, a program without a
+    solution, an error of the numbers. Before the first plan that is the reference's
+    input, or the controller's initial one.
 
     Args:
         controller: With a problem and an initial input.
@@ -371,7 +372,7 @@ class ControlLoop:
         horizon = len(plan.inputs)
         stage = min(int(share), horizon - 1)
         input = plan.inputs[stage]
-        if np.isfinite(plan.means).all() and np.isfinite(state).all():
+        if np.isfinite(plan.means).all() and is_measured(state).all():
             planned_state = _state_along(plan.means[:, :n], min(share, horizon))
             error = self._short_way(state - planned_state)
             input = input - self._gains_of(plan)[stage][:, :n] @ error
@@ -422,9 +423,9 @@ def check_policy(on_failure: str) -> None:
     check_choice("on_failure", on_failure, get_args(OnFailure))
 
 
-def _is_finite(belief: Gaussian) -> bool:
-    mean_is_finite = torch.isfinite(belief.mean).all()
-    return bool(mean_is_finite and torch.isfinite(belief.covariance).all())
+def _is_usable(belief: Gaussian) -> bool:
+    """Tells whether a belief can be decided on."""
+    return is_usable(to_array(belief.mean), to_array(belief.covariance))
 
 
 def _conclude(

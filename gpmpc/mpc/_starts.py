@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from gpmpc._angles import full_turns
+from gpmpc._arrays import is_measured
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, check_kind, check_number
 from gpmpc.gaussian import Gaussian
@@ -344,7 +345,7 @@ class ManyStarts:
         belief = belief.in_order(self.signals.state_names)
         reference = reference.in_order(self.signals).over(self.horizon)
         state = belief.mean.numpy()
-        if not np.isfinite(state).all():
+        if not is_measured(state).all():
             return self.controller.control(belief, reference, previous, parameters)
         if previous is not None and self._can_continue(previous):
             turns = full_turns(state - previous.means[1], self._angles)

@@ -157,6 +157,9 @@ CONTROLLERS = {
 }
 
 
+LOST = (np.nan, 1e38)  # of a sensor that saw nothing
+
+
 def questions(controller, steps, seed=0):
     """Yields measured states of a rough walk, some of them lost, and references."""
     rng = np.random.default_rng(seed)
@@ -165,7 +168,7 @@ def questions(controller, steps, seed=0):
     state = np.zeros(n)
     for k in range(steps):
         state = 0.9 * state + rng.normal(0, 0.3, n)
-        measured = state if k % 9 != 5 else np.full(n, np.nan)
+        measured = state if k % 9 != 5 else np.full(n, LOST[k % len(LOST)])
         path = np.zeros((H + 1, n))
         path[:, 0] = np.sin(0.1 * (k + np.arange(H + 1)))
         inputs = 0.2 * np.cos(0.1 * (k + np.arange(H)))[:, None]

@@ -83,7 +83,7 @@ def questions(estimator, steps=40, seed=0):
         state = 0.9 * state + rng.normal(0, 0.2, len(state))
         seen = measurement.predict(torch.from_numpy(state)[None]).mean[0].numpy()
         measured = seen + rng.normal(0, 0.02, len(seen))
-        measured[rng.random(len(measured)) < 0.2] = np.nan
+        measured[rng.random(len(measured)) < 0.2] = np.nan if k % 2 else -1e38
         if k % 7 == 3 and len(measurement.angles):
             measured[list(measurement.angles)] += 2 * np.pi
         reference = np.zeros(len(state))

@@ -3,7 +3,15 @@ import pytest
 
 from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.models import KnownModel
-from gpmpc.mpc import GPMPC, Box, ControlLoop, Problem, Reference, Tracking
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    ControlLoop,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+)
 from gpmpc.mpc.baselines import LQR
 from gpmpc.propagation import Linearization
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
@@ -111,3 +119,16 @@ def test_a_controller_that_takes_no_plan_says_so():
     for key in ("plan", "parameters"):
         with pytest.raises(SettingError, match=f"{key}: is nothing that LQR.control"):
             loop.input(np.zeros(2), GOAL, **{key: np.zeros((10, 1))})
+
+
+@pytest.mark.parametrize("form", ["trajectory", "velocity"])
+@pytest.mark.parametrize("mark", [np.inf, 3.4e38, -1.7e308])
+def test_a_sensors_mark_of_nothing_costs_one_step(form, mark):
+    settings = PredictionSettings(form=form, covariance="none")
+    loop = ControlLoop(controller(prediction=settings))
+    x = np.zeros(2)
+    for k in range(12):
+        u = loop.input([mark, 0.0] if k == 6 else x, GOAL)
+        x = next_state(x, u)
+    assert loop.failures == 1
+    assert loop.judgement.level == "healthy"
