@@ -66,7 +66,7 @@ def read_array(
 
 
 def is_measured(values: Array) -> NDArray[np.bool_]:
-    """Tells which numbers were measured: not NaN, nor ``UNMEASURED`` or more in size."""
+    """Tells which numbers were measured: no NaN, and below ``UNMEASURED`` in size."""
     return np.abs(values) < UNMEASURED
 
 
