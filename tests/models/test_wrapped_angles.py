@@ -16,7 +16,7 @@ from gpmpc.estimation import (
     estimate_varying_noise,
 )
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import SlidingWindow, SparseTrainer, Trainer, Transitions
+from gpmpc.gp import GPPosterior, SlidingWindow, SparseTrainer, Trainer, Transitions
 from gpmpc.models import (
     Affine,
     CasadiFunction,
@@ -25,6 +25,7 @@ from gpmpc.models import (
     Features,
     KnownModel,
     Lags,
+    NoisyModel,
     ResidualModel,
     RollOut,
 )
@@ -225,8 +226,16 @@ def test_a_noise_that_varies_is_the_same_a_turn_on():
     after[:, 1] += deviations * rng.normal(size=150)
     rows = Transitions(states, np.zeros((150, 1)), after)
     known = AngleOf(Affine.identity(2, 1), 2, 1)
-    varying = estimate_varying_noise(known, rows, block=5)
+    one = torch.ones(1, dtype=F)
+    some = torch.zeros(1, 4, dtype=F)
+    loud = GPPosterior.from_hyperparameters(
+        some, some[:, :1] + 3, some + 1, one, 0.1 * one, 1, "value"
+    )
+    # The noise of a noisy model is learned anew, not on top of itself.
+    noisy = NoisyModel(known, loud, [1])
+    varying = estimate_varying_noise(noisy, rows, block=5)
     assert varying.outputs == (1,)
+    assert varying.model.model is known
     x = torch.tensor([[np.pi - 0.5, 0.0], [np.pi + 0.5, 0.0], [3.2, 0.0]], dtype=F)
     u = torch.zeros(3, 1, dtype=F)
     noise = varying.model.noise(x, u)
@@ -238,9 +247,6 @@ def test_a_noise_that_varies_is_the_same_a_turn_on():
         assert torch.allclose(varying.model.noise(turned, u), noise, rtol=1e-6)
         V = varying.model.linearize(turned.numpy(), u.numpy()).covariance
         assert np.allclose(V, noise, rtol=1e-6)
-    # The noise of a noisy model is learned anew, not on top of itself.
-    again = estimate_varying_noise(varying.model, rows, block=5)
-    assert again.model.model is known
 
 
 class AngleOf(KnownModel):
