@@ -16,6 +16,7 @@ from gpmpc.exceptions import DataError
 MOST_OUT_OF_ORDER = 0.05
 CLOSE = 0.6  # of the usual time step: a row that is closer to another mixes two clocks
 MOST_FIT = 0.9  # of the rows out of order that have to fit, to be sorted
+MOST_DROPS = 0.2  # of the rows; beyond, neighbours in the file are none in time
 JUMP = 60.0  # [s] from which a step of time is a jump, if it is also
 JUMP_STEPS = 100  # usual time steps: over neither is anything resampled
 ORDER_ROWS = "name the column of the runs, or order the rows"
@@ -105,16 +106,35 @@ def _rising_rows(stamps: Array, latest: Array, where: str, hint: str) -> Stamps:
 def _fit_between(stamps: Array, is_late: np.ndarray) -> bool:
     """Tells whether late rows, sorted in, are as far from others as is usual.
 
+    True where late rows fill places that no other row has: a file holds them in another
+    order. False where two runs or two clocks overlap in time.
+
     ``is_late`` (K,) marks rows with an earlier stamp than a row before them.
     """
     order = np.argsort(stamps, kind="stable")
     steps = np.diff(stamps[order])
     if not (steps > 0).any():
         return False
-    usual = float(np.median(steps[steps > 0]))
+    usual = _usual_step(stamps, steps)
     nearest = np.minimum(np.r_[np.inf, steps], np.r_[steps, np.inf])
     fits = nearest[is_late[order]] >= CLOSE * usual
     return float(fits.mean()) >= MOST_FIT
+
+
+def _usual_step(stamps: Array, sorted_steps: Array) -> float:
+    """Returns the usual time step [s] of rows that are partly out of order.
+
+    Two runs that overlap have half of it, once they are sorted. So steps are taken from
+    neighbours in the file where most of these follow each other in time as well.
+
+    Args:
+        stamps: In the order of the file (K,) [s].
+        sorted_steps: Between sorted stamps (K - 1,) [s], some of them positive.
+    """
+    steps = np.diff(stamps)
+    if (steps < 0).sum() > MOST_DROPS * len(steps) or not (steps > 0).any():
+        steps = sorted_steps
+    return float(np.median(steps[steps > 0]))
 
 
 def find_jumps(time: Array, max_gap: float | None) -> np.ndarray:

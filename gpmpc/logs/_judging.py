@@ -195,7 +195,8 @@ def check_train(train: Log) -> None:
     if longest < needed:
         raise DataError(
             f"learning needs {needed} rows without a gap; the longest piece to learn "
-            f"from has {longest}: log longer runs, or allow longer gaps (max_gap)"
+            f"from has {longest}: log longer runs, or resample over gaps (rate and "
+            "max_gap)"
         )
 
 

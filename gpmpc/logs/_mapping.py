@@ -235,7 +235,8 @@ class LogMapping:
     runs: dict[str, dict[str, str]] = field(default_factory=dict)
     #: to which rows are resampled [Hz]; None leaves them as they are
     rate: float | None = None
-    #: no value is carried over a longer gap [s]; 1.5 time steps by default
+    #: no value is carried over a longer gap [s]; 1.5 time steps by default, which is
+    #: also the most where no rate resamples over gaps
     max_gap: float | None = None
     #: ranges (lowest, highest) of columns; rows outside are left out.
     keep: dict[str, tuple[float, float]] = field(default_factory=dict)

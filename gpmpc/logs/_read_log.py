@@ -20,7 +20,7 @@ from gpmpc.logs._log import Log, LogRun
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._run_tables import RunTable, tabulate
 from gpmpc.logs._runs import split_into_runs
-from gpmpc.logs._usable_rows import select_rows, usual_spread
+from gpmpc.logs._usable_rows import least_motion, select_rows
 
 SHORTEST_STEP = 1e-5  # [s] of rows that are measured one by one
 LONGEST_STEP = 3600.0  # [s] likewise
@@ -66,11 +66,11 @@ def read_log(
     findings: list[Finding] = []
     tables = _read_run_tables(paths, mapping, partial, findings)
     step = _time_step(tables, paths[0], mapping, findings)
-    spread = usual_spread([mapping.split(table.values).states for table in tables])
+    least = least_motion([mapping.split(table.values).states for table in tables], step)
     runs = []
     for table in tables:
         run_findings = RunFindings(table.name, findings)
-        run = select_rows(table, step, spread, mapping, run_findings)
+        run = select_rows(table, step, least, mapping, run_findings)
         if run is not None:
             runs.append(run)
     _check_content(runs, paths, findings)

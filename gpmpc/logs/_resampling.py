@@ -47,9 +47,7 @@ def grid_of_rows(
     """
     rows = len(stamps.time)
     budget.take(_memory(rows, columns), f"{rows} rows of {columns} columns")
-    breaks = stamps.after_reversal.copy()
-    breaks[find_jumps(stamps.time, max_gap) + 1] = True
-    return Grid(stamps.time, breaks)
+    return Grid(stamps.time, _begins_piece(stamps, max_gap))
 
 
 def grid_at_rate(
@@ -112,7 +110,7 @@ def common_pieces(
         DataError: There is none.
     """
     pieces = {
-        topic: cut_pieces(topic_stamps.time, max_gap)
+        topic: cut_pieces(topic_stamps, max_gap)
         for topic, topic_stamps in stamps.items()
     }
     common = reduce(intersect_pieces, pieces.values())
@@ -128,12 +126,20 @@ def common_pieces(
     return common
 
 
-def cut_pieces(time: Array, max_gap: float | None) -> Array:
-    """Returns begins and ends (P, 2) [s] of the pieces between jumps."""
-    jumps = find_jumps(time, max_gap)
-    begins = time[np.r_[0, jumps + 1]]
-    ends = time[np.r_[jumps, len(time) - 1]]
+def cut_pieces(stamps: Stamps, max_gap: float | None) -> Array:
+    """Returns begins and ends (P, 2) [s] of the pieces between jumps and reversals."""
+    time = stamps.time
+    first_rows = np.flatnonzero(_begins_piece(stamps, max_gap))
+    begins = time[np.r_[0, first_rows]]
+    ends = time[np.r_[first_rows - 1, len(time) - 1]]
     return np.column_stack([begins, ends])
+
+
+def _begins_piece(stamps: Stamps, max_gap: float | None) -> np.ndarray:
+    """Tells before which rows (K,) time ran backwards, or jumped."""
+    begins = stamps.after_reversal.copy()
+    begins[find_jumps(stamps.time, max_gap) + 1] = True
+    return begins
 
 
 def intersect_pieces(pieces: Array, others: Array) -> Array:

@@ -20,17 +20,25 @@ from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._run_tables import RunTable
 
 REST_TIME = 0.5  # [s] for which nothing moves at rest
-REST_SHARE = 0.1  # of a state's usual spread that counts as no movement
-MOST_HELD = 0.5  # of the rows; beyond, a signal has another rate than its table
+REST_SHARE = 0.1  # of a state's usual motion that counts as no movement
+USUAL_MOTION = 0.9  # quantile of the ranges within ``REST_TIME``
+# of the rows; beyond, a signal has another rate than its table. Half of them repeat at
+# half the rate; clocks that drift make it a little less.
+MOST_HELD = 0.45
 SHORT_STEP = 0.5  # time steps; a shorter one is uneven
-LONG_STEP = 1.5  # time steps likewise, where the mapping names no largest gap
+LONG_STEP = 1.5  # time steps likewise
 
 
-def usual_spread(states: Sequence[Array]) -> Array:
-    """Returns half of the range (n,) that holds 80 % of the rows of all runs.
+def least_motion(states: Sequence[Array], step: float) -> Array:
+    """Returns the ranges (n,) within ``REST_TIME`` up to which states do not move.
+
+    They are a tenth of what the states usually move in that time: a slow state that
+    drifts at its usual speed moves. Of fast states it is a tenth of their spread, half
+    of the range that holds 80 % of the rows.
 
     Args:
-        states: Of each run (K, n); rows with a NaN do not count.
+        states: Of each run (K, n); rows with a NaN do not count for the spread.
+        step: Time step of the log [s].
 
     Raises:
         DataError: No row has a value of every state.
@@ -39,13 +47,15 @@ def usual_spread(states: Sequence[Array]) -> Array:
     if not len(present):
         raise DataError("no row has a value of every state")
     low, high = np.quantile(present, [0.1, 0.9], axis=0)
-    return (high - low) / 2
+    spread = (high - low) / 2
+    ranges = np.concatenate([_ranges_of_rest_time(rows, step) for rows in states])
+    return REST_SHARE * np.minimum(spread, np.quantile(ranges, USUAL_MOTION, axis=0))
 
 
 def select_rows(
     table: RunTable,
     step: float,
-    spread: Array,
+    least: Array,
     mapping: LogMapping,
     findings: RunFindings,
 ) -> LogRun | None:
@@ -54,7 +64,7 @@ def select_rows(
     Args:
         table: Of the run.
         step: Time step of the log [s].
-        spread: See ``usual_spread`` (n,).
+        least: See ``least_motion`` (n,).
         mapping: Says what is left out.
         findings: Of the run, which takes what is left out.
 
@@ -68,12 +78,12 @@ def select_rows(
     rows = _RowSelection(len(table.time), findings)
     rows.leave_out(table.outside, "outside of keep", "outside the ranges of keep")
     if mapping.rest == "drop":
-        at_rest = _at_rest(values.states, values.inputs, spread, step)
+        at_rest = _at_rest(values.states, values.inputs, least, step)
         rows.leave_out(at_rest, "at rest", "where nothing moves")
     is_missing = np.asarray(np.isnan(table.values).any(axis=1))
     rows.leave_out(is_missing, "missing value", "in a gap or without a value")
     _leave_out_held_values(rows, table.name, values.states, mapping)
-    motion = _motion(values.states, spread, step)
+    motion = _ranges_of_rest_time(values.states, step) > least
     _note_held_sensors(values.states, motion, mapping, findings)
     used = np.flatnonzero(rows.usable)
     if len(used) < 2:
@@ -111,6 +121,8 @@ def _leave_out_held_values(
     rows: _RowSelection, run: str, states: Array, mapping: LogMapping
 ) -> None:
     """Leaves out rows in which a whole signal of the states repeats the row before."""
+    usable = rows.usable.copy()  # of all signals the same: they may repeat in turn
+    count = usable.sum()
     for signal, columns in zip(
         mapping.of("states"), mapping.space.columns, strict=True
     ):
@@ -119,17 +131,16 @@ def _leave_out_held_values(
         if len(signal.columns) < 2:  # a single one may repeat by its resolution
             continue
         repeats = (states[1:, columns] == states[:-1, columns]).all(axis=1)
-        held = np.r_[False, repeats] & rows.usable
-        usable = rows.usable.sum()
-        if held.sum() >= max(usable - 1, 1):
+        held = np.r_[False, repeats] & usable
+        if held.sum() >= max(count - 1, 1):
             raise DataError(
                 f"run {run}: {signal.name} never changes: its sensor was silent; "
                 "leave it out, or held: use"
             )
-        if held.sum() > MOST_HELD * max(usable, 1):
-            changes = (rows.usable & ~held).sum()
+        if held.sum() > MOST_HELD * max(count, 1):
+            changes = (usable & ~held).sum()
             raise DataError(
-                f"run {run}: {signal.name} changes in {changes} of {usable} rows only: "
+                f"run {run}: {signal.name} changes in {changes} of {count} rows only: "
                 "its own rate is lower; state a lower rate, or held: use"
             )
         text = f"where {signal.name} repeats the row before"
@@ -187,18 +198,21 @@ def _find_ends_of_pieces(
         Whether a piece ends with each used row but the last (U - 1,).
     """
     longest = LONG_STEP * step
-    if mapping.max_gap and not mapping.rate:
-        longest = mapping.max_gap
+    if mapping.max_gap and not mapping.rate:  # rows that follow are one step apart
+        longest = min(longest, mapping.max_gap)
     steps = np.diff(table.time[used])
     is_uneven = (steps > longest) | (steps < SHORT_STEP * step)
     are_apart = np.diff(used) > 1
     is_before_break = table.breaks[used[1:]]
     is_jump = is_before_break & (steps > JUMP)  # which has its own finding
-    _note_gaps(steps[is_uneven & ~are_apart & ~is_jump], step, findings)
+    uneven = steps[is_uneven & ~are_apart & ~is_jump]
+    _note_gaps(uneven, step, mapping, findings)
     return is_uneven | are_apart | is_before_break
 
 
-def _note_gaps(uneven: Array, step: float, findings: RunFindings) -> None:
+def _note_gaps(
+    uneven: Array, step: float, mapping: LogMapping, findings: RunFindings
+) -> None:
     """Notes uneven time steps (G,) [s] between neighbouring rows."""
     if not len(uneven):
         return
@@ -206,6 +220,8 @@ def _note_gaps(uneven: Array, step: float, findings: RunFindings) -> None:
     longest = uneven.max()
     if shortest > step:
         text = f"{len(uneven)} gaps, up to {longest:.3g} s: boundaries"
+        if not mapping.rate and shortest <= (mapping.max_gap or 0.0):
+            text += " (only a rate resamples over gaps of up to max_gap)"
     else:
         text = (
             f"{len(uneven)} steps of {shortest:.3g} to {longest:.3g} s: boundaries "
@@ -214,21 +230,21 @@ def _note_gaps(uneven: Array, step: float, findings: RunFindings) -> None:
     findings.add("gap", len(uneven), text)
 
 
-def _motion(states: Array, spread: Array, step: float) -> np.ndarray:
-    """Tells which states move around a row (K, n): by a tenth of their usual spread."""
+def _ranges_of_rest_time(states: Array, step: float) -> Array:
+    """Returns the ranges of states (K, n) within ``REST_TIME`` around each row."""
     size = min(max(round(REST_TIME / step), 3), len(states))
-    return _range_within(np.nan_to_num(states), size) > REST_SHARE * spread
+    return _range_within(np.nan_to_num(states), size)
 
 
-def _at_rest(states: Array, inputs: Array, spread: Array, step: float) -> np.ndarray:
-    """Finds rows (K,) of stretches in which inputs stay and no state moves much.
+def _at_rest(states: Array, inputs: Array, least: Array, step: float) -> np.ndarray:
+    """Finds rows (K,) of stretches in which inputs stay and no state moves.
 
-    A state that does not move changes by a tenth of its usual spread at most.
+    ``least`` holds the ranges (n,) up to which states do not; see ``least_motion``.
     """
     size = max(round(REST_TIME / step), 3)
     if len(states) < size or not inputs.shape[1]:
         return np.zeros(len(states), dtype=bool)
-    limit = np.concatenate([REST_SHARE * spread, np.zeros(inputs.shape[1])])
+    limit = np.concatenate([least, np.zeros(inputs.shape[1])])
     values = np.nan_to_num(np.concatenate([states, inputs], axis=1))
     is_still = (_range_within(values, size) <= limit).all(axis=1)
     return binary_dilation(is_still, np.ones(2 * (size // 2) + 1))

@@ -135,6 +135,19 @@ def test_no_transition_or_window_goes_over_a_gap(tmp_path):
     assert all(w.tobytes() in whole_windows for w in windows.states)
 
 
+@pytest.mark.parametrize("max_gap", [0.05, 1.0])
+def test_without_a_rate_no_longer_gap_is_one_step(tmp_path, max_gap):
+    table = pendulum_table().drop(index=[200])  # a step of 0.04 s
+    log = read_log(written(tmp_path, table), {**PENDULUM, "max_gap": max_gap})
+    assert log.runs[0].begins == (0, 200)
+    assert "only a rate resamples" in log.findings[0].text
+    resampled = read_log(
+        written(tmp_path, table), {**PENDULUM, "max_gap": max_gap, "rate": 50}
+    )
+    assert resampled.runs[0].begins == (0,)
+    assert len(resampled) == 400
+
+
 def test_resampled_rows_do_not_depend_on_when_the_clock_began(tmp_path):
     table = pendulum_table(100)
     first, later = (
@@ -316,6 +329,46 @@ def test_a_repeated_sample_of_a_moving_system_is_left_out(tmp_path):
     )
     with pytest.raises(DataError, match=r"position changes in \d+ of 300 rows only"):
         read_log(written(tmp_path, table), BODY)
+
+
+def test_signals_that_repeat_in_turn_have_a_lower_rate(tmp_path):
+    table = body_table()
+    at_half_the_rate = np.arange(300) // 2 * 2
+    in_turn = np.maximum(at_half_the_rate - 1 + 2 * (np.arange(300) % 2), 0)
+    for columns, rows in (
+        (["px", "py", "pz"], at_half_the_rate),
+        (["wx", "wy", "wz"], in_turn),
+    ):
+        table[columns] = body_table()[columns].to_numpy()[rows]
+        with pytest.raises(DataError, match="position changes in 150 of 300 rows only"):
+            read_log(written(tmp_path, table), BODY)
+
+
+@pytest.mark.parametrize("step", [0.01, 1.0])
+def test_slow_and_steady_motion_is_not_rest(tmp_path, step):
+    rows = 2000
+    t = step * np.arange(rows)
+    # A plant of a time constant of 1000 steps is driven by steps of 500, and a car goes
+    # on steadily.
+    drive = np.repeat([1.0, -0.5, 0.7, -1.0], rows // 4)
+    slow = np.zeros(rows)
+    for k in range(1, rows):
+        slow[k] = slow[k - 1] + (drive[k - 1] - slow[k - 1]) / 1000
+    way = 20 * t
+    table = pandas.DataFrame({"t": t, "slow": slow, "way": way, "drive": drive})
+    for state in ("slow", "way"):
+        mapping = {"time": "t", "states": {"x": [state]}, "inputs": {"u": ["drive"]}}
+        assert len(read_log(written(tmp_path, table), mapping)) == rows
+    standing = pandas.DataFrame(
+        {
+            "t": step * np.arange(2 * rows),
+            "slow": np.r_[np.zeros(rows), slow],
+            "drive": np.r_[np.zeros(rows), drive],
+        }
+    )
+    mapping = {"time": "t", "states": {"x": ["slow"]}, "inputs": {"u": ["drive"]}}
+    log = read_log(written(tmp_path, standing), mapping)
+    assert abs(kinds(log)["at rest"] - rows) < 60
 
 
 def test_parts_at_rest_are_left_out_unless_asked_for(tmp_path):

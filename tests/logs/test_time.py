@@ -144,6 +144,26 @@ def test_a_clock_that_was_set_back_is_named_with_a_way_out(tmp_path):
     assert len(read_log(path, {**BAG_MAPPING, "stamp": "log"})) == ROWS
 
 
+@pytest.mark.parametrize("offset", [0.1, 0.37, 0.5])
+@pytest.mark.parametrize("rows", [ROWS, ROWS * 3 // 4])
+def test_two_runs_at_one_time_are_never_mixed(tmp_path, offset, rows):
+    first = strange.pendulum(ROWS)
+    second = strange.pendulum(rows)
+    second["t"] += offset * STEP
+    pandas.concat([first, second]).to_csv(tmp_path / "arm.csv", index=False)
+    with pytest.raises(DataError, match="runs backwards in row 401 .*the runs"):
+        read_log(tmp_path / "arm.csv", TABLE_MAPPING)
+
+
+@pytest.mark.parametrize("rate", [None, 50])
+def test_nothing_is_carried_over_a_clock_that_was_set_back(tmp_path, rate):
+    table = strange.pendulum(ROWS)
+    table["t"] -= 0.2 * (np.arange(ROWS) >= 200)
+    table.to_csv(tmp_path / "arm.csv", index=False)
+    (run,) = read_log(tmp_path / "arm.csv", {**TABLE_MAPPING, "rate": rate})
+    assert run.begins == (0, 200)
+
+
 def test_few_rows_of_a_clock_that_was_set_back_are_left_out(tmp_path):
     topics = strange.pendulum_topics(ROWS)
     for name, topic in topics.items():
