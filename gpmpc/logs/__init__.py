@@ -21,7 +21,8 @@ How ``read_log`` makes rows of files, and where each step is:
 How ``learn`` makes a model of a log:
 
 1. structures    ``_structures`` has the simplest models, and what they may grow by. To
-                 add a structure, see there. The models themselves are those of
+                 add a structure, see there. ``_input_delay`` says by how many rows
+                 inputs may act late. The models themselves are those of
                  ``gpmpc.models``.
 2. folds         ``_folds`` deals runs, or blocks of rows, to two or four folds.
 3. rows          ``_smoothing`` takes the noise from the rows that models are fitted to.

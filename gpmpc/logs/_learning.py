@@ -23,7 +23,7 @@ from gpmpc.logs._folds import MANY_RUNS, split_folds
 from gpmpc.logs._log import Log
 from gpmpc.logs._ranges import ranges_of
 from gpmpc.logs._search import Search
-from gpmpc.logs._structures import Candidate, most_reach, past_rows
+from gpmpc.logs._structures import Candidate, most_reach, past_rows, rows_late
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._namings import NO_NAMINGS, Namings
@@ -105,7 +105,8 @@ def learn(
     advice = "Say kind: angle of it in the mapping"
     warn_of_turns(log.transitions(), log.space.angles, advice)
     reach = most_reach(log, for_control)
-    past = past_rows(reach)
+    late = rows_late(log, reach)
+    past = past_rows(reach, late)
     affordable = _most_steps(log, past)
     if affordable < steps:
         progress(f"short log: rollouts of {affordable} steps decide, not of {steps}")
@@ -117,6 +118,7 @@ def learn(
         log=log,
         folds=folds.parts,
         reach=reach,
+        late=late,
         points=points,
         steps=steps,
         seed=seed,

@@ -74,6 +74,7 @@ class Search:
             of" a key, the logarithms of the errors of its simulations; by "averages of"
             one, the shares and errors of its corrections.
         for_control: Leaves out what no controller can plan with.
+        late: Rows by which inputs are likely to act late.
     """
 
     def __init__(
@@ -87,6 +88,7 @@ class Search:
         progress: Any,
         memory: MutableMapping[str, Any],
         for_control: bool,
+        late: int = 0,
     ):
         self._log = log
         self._folds = folds
@@ -95,9 +97,9 @@ class Search:
         self._progress = progress
         self._memory = memory
         self._for_control = for_control
-        self._bases = bases(log, reach)
+        self._bases = bases(log, reach, late)
         kinematics = self._bases[0].model.kinematics
-        past = past_rows(reach)
+        past = past_rows(reach, late)
         self._held_out = HeldOutErrors(log, folds, kinematics, past, steps)
         self.judged_steps = self._held_out.judged_steps
         self._fits = StructureFits(

@@ -25,6 +25,7 @@ import numpy as np
 
 from gpmpc._dynamics import Array
 from gpmpc.logs._fitting import PAST
+from gpmpc.logs._input_delay import MOST_ROWS, likely_delay
 from gpmpc.logs._log import Log
 from gpmpc.logs._system_structures import system_nominal
 from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
@@ -108,6 +109,7 @@ class Structure:
     reach: int  #: most rows that its additions may look back on
     #: smallest and largest features in the log (2, d); empty where no term needs them
     ranges: tuple[tuple[float, ...], ...] = ()
+    late: int = 0  #: rows by which the inputs are likely to act late
     additions: tuple[Addition, ...] = ()
     gps: tuple[GroupGP, ...] = ()
     #: structures without GPs, each with the groups of outputs that are its own; none of
@@ -195,18 +197,44 @@ def most_reach(log: Log, for_control: bool) -> int:
     return max([reach for reach in _REACHES if reach <= affordable], default=0)
 
 
-def past_rows(reach: int) -> int:
-    """Returns the rows before a start that structures of a reach need at most."""
-    return max(PAST, reach) + LATE + 1
+def rows_late(log: Log, reach: int) -> int:
+    """Returns by how many rows the inputs of a log are likely to act late.
+
+    That of a multirotor's motors is known.
+
+    Args:
+        log: All runs.
+        reach: Most rows that a structure may look back on.
+    """
+    if log.mapping.model == "rigid_body":
+        return 0
+    return likely_delay(log, Increments(log.space), min(reach, MOST_ROWS))
 
 
-def bases(log: Log, reach: int) -> list[Structure]:
+def past_rows(reach: int, late: int = 0) -> int:
+    """Returns the rows before a start that structures need at most.
+
+    Args:
+        reach: Most rows that they may look back on.
+        late: Rows by which inputs are likely to act late.
+    """
+    return max(PAST, reach) + max(LATE, late + 1) + 1
+
+
+def bases(log: Log, reach: int, late: int = 0) -> list[Structure]:
     """Returns the structures that a search begins with, all of which are tried.
 
     Args:
         log: All runs.
         reach: Most rows that they may look back on.
+        late: Rows by which inputs are likely to act late.
     """
+    structures = _bases(log, reach)
+    return [replace(structure, late=late) for structure in structures]
+
+
+def _bases(log: Log, reach: int) -> list[Structure]:
+    """Returns the bases, whose inputs act at once."""
     if log.mapping.model == "rigid_body":
         body = RigidBodyKinematics(log.space)
         affine_bases = _affine_bases(body, len(log.input_names), reach)
@@ -305,8 +333,14 @@ def additions(structure: Structure) -> tuple[Addition, ...]:
         alone = _alone_additions(structure.model)
         possible = (*_MULTIROTOR_ADDITIONS, *memories, lags, *alone)
     else:
-        products = _product_additions(structure)
-        possible = (*_AFFINE_ADDITIONS, *_MEMORY_ADDITIONS, *products, lags, _REFINED)
+        possible = (
+            *_AFFINE_ADDITIONS,
+            *_late_additions(structure.late),
+            *_MEMORY_ADDITIONS,
+            *_product_additions(structure),
+            lags,
+            _REFINED,
+        )
     return tuple(one for one in possible if one.reach <= structure.reach)
 
 
@@ -337,6 +371,7 @@ _MEMORY_ADDITIONS = tuple(
 )
 
 
+_SHARES_OF_DELAY = (0.2, 0.4, 0.6, 0.8)  # of a likely delay, which are tried as well
 _REACHES = sorted({LAG_ROWS, *(one.reach for one in _MEMORY_ADDITIONS)})
 
 
@@ -374,6 +409,39 @@ def _with_products(products: Products) -> Callable[[LogModel], LogModel | None]:
         if len(model.time_constants):
             return None
         return replace(model, memory=replace(memory, products=products))
+
+    return extend
+
+
+def _late_additions(late: int) -> list[Addition]:
+    """Returns delays of the inputs up to a likely one; none of none.
+
+    What looks like one may be a shorter one and a first-order lag.
+    """
+    if not late:
+        return []
+    shorter = {max(round(share * late), 1) for share in _SHARES_OF_DELAY}
+    rows = sorted({late, late + 1} | shorter)
+    return [
+        Addition(
+            f"late:{number}", _late_words(number), _with_delay(number), True, number
+        )
+        for number in rows
+    ]
+
+
+def _late_words(rows: int) -> str:
+    return f"inputs {rows} {'row' if rows == 1 else 'rows'} late"
+
+
+def _with_delay(rows: int) -> Callable[[LogModel], LogModel | None]:
+    def extend(model: LogModel) -> LogModel | None:
+        nominal = model.nominal
+        is_still = isinstance(nominal, AffineNominal) and not nominal.fitted
+        # A memory knows the past inputs.
+        if model.lag or is_still or not model.memory.empty:
+            return None
+        return replace(model, lag=rows)
 
     return extend
 

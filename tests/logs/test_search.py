@@ -19,7 +19,13 @@ from gpmpc.logs._ranges import ranges_of
 from gpmpc.logs._rollout_corrections import Rollouts, choose_averages
 from gpmpc.logs._search import Search
 from gpmpc.logs._smoothing import smooth
-from gpmpc.logs._structures import additions, bases, most_reach, past_rows
+from gpmpc.logs._structures import (
+    additions,
+    bases,
+    most_reach,
+    past_rows,
+    rows_late,
+)
 from gpmpc.models import LogModel
 from gpmpc.models._correction import Correction, Prior
 from gpmpc.models._kinematics import Increments
@@ -124,6 +130,42 @@ def test_short_runs_are_looked_back_on_a_little(rows, reach, longest):
     possible = [one.words for one in additions(bases(log, reach)[0])]
     assert longest in [words[:11] for words in possible]
     assert ("14 past rows" in possible) == (reach >= 14)
+
+
+def test_inputs_that_act_late_are_known_to_controllers():
+    rng = np.random.default_rng(0)
+    rows = 240
+    commands = held_inputs(rng, rows, 1.0, hold=4)
+    logs = []
+    for late in (0, 3):
+        acting = np.vstack([np.zeros((late, 1)), commands[: rows - late]])
+        exact = simulate(lambda x, u: [x[1], 4 * u[0] - 2 * x[1]], [0, 0], acting)
+        states = exact + rng.normal(size=exact.shape) * [0.002, 0.02]
+        logs.append(log_of([states], [commands]))
+    assert [rows_late(log, reach=40) for log in logs] == [0, 3]
+    search = Search(
+        log=logs[1],
+        folds=split_folds(logs[1], past_rows(40, 3), 5, most=2).parts,
+        reach=40,
+        points=10,
+        steps=5,
+        seed=0,
+        progress=lambda text: None,
+        memory={},
+        for_control=True,
+        late=3,
+    )
+    search._search_nominals()
+    assert search.best.model.lag == 3
+    assert "inputs 3 rows late" in search.best.name
+
+
+def test_what_is_slower_than_all_that_is_sought_is_no_delay():
+    commands = held_inputs(np.random.default_rng(0), 400, 1.0, hold=4)
+    acting = np.vstack([np.zeros((30, 1)), commands[:370]])
+    states = simulate(lambda x, u: [x[1], 4 * u[0] - 2 * x[1]], [0, 0], acting)
+    assert rows_late(log_of([states], [np.zeros_like(commands)]), reach=40) == 0
+    assert rows_late(log_of([states], [commands]), reach=0) == 0
 
 
 def test_runs_are_dealt_so_that_ranges_are_covered():

@@ -1,0 +1,57 @@
+"""Finds by how many rows the inputs of a log act late, to try models that know it.
+
+What moves a state in a step is regressed on the state and on the inputs of an earlier
+row, once for each delay; the delay that leaves least is the likely one. A first-order
+lag looks like a delay as well: which of the two it is, or both, rollouts decide.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from gpmpc.exceptions import DataError
+from gpmpc.logs._log import Log
+from gpmpc.models._kinematics import Kinematics
+
+MOST_ROWS = 15  # that are sought
+_WINDOWS = 6000
+_SIGNIFICANT = 20.0  # twice the logarithm of the likelihood ratio that says something
+
+
+def likely_delay(log: Log, kinematics: Kinematics, most: int) -> int:
+    """Returns by how many rows the inputs are likely to act late; zero for none.
+
+    There is none either where the longest one explains most: what is slower than all
+    that is sought is no delay.
+
+    Args:
+        log: All runs.
+        kinematics: Have the features, and the outputs that move a state.
+        most: Rows that are sought.
+    """
+    if not log.input_names or most < 1:
+        return 0
+    try:
+        windows = log.windows(1, past=most, most=_WINDOWS)
+    except DataError:
+        return 0
+    states = windows.states[:, most]
+    next_states = windows.states[:, most + 1]
+    context = windows.context[:, most]
+    outputs = kinematics.outputs(states, next_states, log.time_step)
+    moves = outputs.std(axis=0) > 0
+    if not moves.any():
+        return 0
+    logarithms = []  # of the residuals' variances, summed over outputs
+    for rows in range(most + 1):
+        inputs = windows.inputs[:, most - rows]
+        features = kinematics.features(states, inputs, context)
+        regressors = np.column_stack([np.ones(len(features)), features])
+        solution: Any = np.linalg.lstsq(regressors, outputs[:, moves], rcond=1e-8)[0]
+        residuals = outputs[:, moves] - regressors @ solution
+        exact = 1e-20 * outputs[:, moves].var(axis=0)
+        variances = np.maximum(np.square(residuals).mean(axis=0), exact)
+        logarithms.append(np.log(variances).sum())
+    best = int(np.argmin(logarithms))
+    gain = len(outputs) * (logarithms[0] - logarithms[best])
+    return best if best < most and gain > _SIGNIFICANT else 0
