@@ -9,8 +9,9 @@ at 100 Hz; the model is learned from the first 48 s and judged on the last 12 s.
 arXiv:2603.09908; not part of this package), two held out of each split. A line for each
 group of states and step ahead: the model's mean error, over that of the best baseline,
 coverage and width of its 95 % intervals. With ``--fly`` each model is flown to its
-plant's task (``log_flights``); ``--plants "lagging pendulum"`` is one more plant. Lines
-are also appended to ``outputs/benchmarks/log_models.jsonl``.
+plant's task (``log_flights``); with ``--for-control`` it is one to plan with.
+``--plants "lagging pendulum"`` is one more plant. Lines are also appended to
+``outputs/benchmarks/log_models.jsonl``.
 """
 
 import argparse
@@ -168,6 +169,7 @@ def main() -> None:
     parser.add_argument("--flights", type=Path)
     parser.add_argument("--splits", type=int, default=6)
     parser.add_argument("--fly", action="store_true")
+    parser.add_argument("--for-control", action="store_true")
     parser.add_argument("--progress", action="store_true")
     arguments = parser.parse_args()
     if arguments.flights is None:
@@ -177,7 +179,7 @@ def main() -> None:
     for case in cases:
         began = time.process_time()
         show = print if arguments.progress else (lambda text: None)
-        learned = learn(case.train, progress=show)
+        learned = learn(case.train, progress=show, for_control=arguments.for_control)
         judgement = judge(learned, case.held_out, case.train)
         report(case, learned, judgement)
         print(f"  {time.process_time() - began:.0f} s of one core", flush=True)
