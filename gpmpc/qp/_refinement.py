@@ -164,17 +164,21 @@ def _take_newton_step(work, k):
 def worst_violation(work):
     """Returns the largest violation beyond what multipliers pay for.
 
-    It is a share of the bound or of a thousandth of the length of x.
+    It is a share of the bound or of a thousandth of the length of x. A constraint at
+    its cap violates that by being inside the bound which it pays for.
     """
     least = work.negligible_length
     length = math.sqrt(max(abs(dot(work.slope, work.value, work.n)), least * least))
     worst = 0.0
     for p in range(work.M):
-        if abs(work.multiplier[p]) < work.cap[p]:
-            above = work.value[p] - work.upper[p]
-            below = work.lower[p] - work.value[p]
-            bound = work.upper[p] if above > below else work.lower[p]
-            violation = max(above, below) - work.negligible[p]
-            size = max(1e-3 * length * work.norm[p], abs(bound))
-            worst = max(worst, violation / size)
+        above = work.value[p] - work.upper[p]
+        below = work.lower[p] - work.value[p]
+        multiplier = work.multiplier[p]
+        is_at_cap = abs(multiplier) >= work.cap[p]
+        at_upper = multiplier > 0.0 if is_at_cap else above > below
+        outside = above if at_upper else below
+        violation = -outside if is_at_cap else outside
+        bound = work.upper[p] if at_upper else work.lower[p]
+        size = max(1e-3 * length * work.norm[p], abs(bound))
+        worst = max(worst, (violation - work.negligible[p]) / size)
     return worst
