@@ -45,6 +45,10 @@ class Status(Enum):
         "no step lowers the cost any more, short of the tolerance: "
         "the plan is the best there was; loosen it"
     )
+    HARD_BOUND_MISSED = (
+        "the program keeps a hard bound, and the plan that the model makes of it "
+        "does not: take more programs a step, or soften the bound"
+    )
 
     def __init__(self, _: str) -> None:
         self.solved = self.name in ("SOLVED", "SOFT_BOUND_MISSED")

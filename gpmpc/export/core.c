@@ -694,15 +694,15 @@ static real largest_violation(const gpmpc_problem *problem)
 }
 #endif
 
-/* Whether the plan keeps the hard rows of the states, nearly. */
-static int keeps_hard_rows(const gpmpc_problem *problem)
+/* Whether the plan misses no hard row of the states by more than a limit. */
+static int keeps_hard_rows(const gpmpc_problem *problem, real limit)
 {
     int k, e;
     for (k = 0; k < H; k++)
         for (e = 0; e < r; e++) {
             real miss =
                 row_miss(problem, k, e, problem->states[k + 1], problem->inputs[k]);
-            if (row_prices[e] > LARGEST && !(miss <= FEASIBLE))
+            if (row_prices[e] > LARGEST && !(miss <= limit))
                 return 0;
         }
     return 1;
@@ -1479,22 +1479,12 @@ static void close_defects(gpmpc_controller *controller)
 }
 #endif
 
-/* Makes the problem at the first guess. Returns whether all functions are finite. */
-static int write_problem(gpmpc_controller *controller, const real *state,
-                         const real *covariance, const gpmpc_reference *reference)
+/* Makes the problem at the states and inputs that the dynamics are linearised at.
+   Returns whether all functions are finite. */
+static int write_local_problem(gpmpc_controller *controller, const real *covariance,
+                               const gpmpc_reference *reference)
 {
     gpmpc_problem *problem = &controller->problem;
-    copy(controller->has_input ? controller->input : initial_input,
-         problem->previous_input, m);
-    read_reference(controller, state, reference);
-    if (GPMPC_ESTIMATES)
-        estimate_disturbance(controller, state);
-    guess_states(controller, state);
-    guess_inputs(controller);
-    if (!linearize(controller)) {
-        follow_inputs(controller);
-        (void)linearize(controller);
-    }
 #if GPMPC_OUTPUTS
     if (!write_outputs(problem, reference))
         return 0;
@@ -1512,6 +1502,36 @@ static int write_problem(gpmpc_controller *controller, const real *state,
     return write_rows(problem, reference);
 }
 
+/* Makes the problem at the first guess. Returns whether all functions are finite. */
+static int write_problem(gpmpc_controller *controller, const real *state,
+                         const real *covariance, const gpmpc_reference *reference)
+{
+    gpmpc_problem *problem = &controller->problem;
+    copy(controller->has_input ? controller->input : initial_input,
+         problem->previous_input, m);
+    read_reference(controller, state, reference);
+    if (GPMPC_ESTIMATES)
+        estimate_disturbance(controller, state);
+    guess_states(controller, state);
+    guess_inputs(controller);
+    if (!linearize(controller)) {
+        follow_inputs(controller);
+        (void)linearize(controller);
+    }
+    return write_local_problem(controller, covariance, reference);
+}
+
+/* Solves the program of the problem at the guess. */
+static void solve_local(gpmpc_controller *controller)
+{
+    condense(controller);
+    solve(&controller->problem, &controller->program, &controller->solution,
+          &controller->candidate);
+#if GPMPC_ELASTIC
+    solve_elastic(controller);
+#endif
+}
+
 /* Decides: solves the program of the problem at the first guess, and takes its step
    whole (the real-time iteration of Diehl, Bock and Schloeder, 2005). Writes plan and
    violation; returns the status, and whether the plan may be applied. */
@@ -1525,11 +1545,15 @@ static int decide(gpmpc_controller *controller, const real *state,
     *applicable = 0;
     if (!write_problem(controller, state, covariance, reference))
         return GPMPC_FUNCTION_NOT_FINITE;
-    condense(controller);
-    solve(problem, &controller->program, &controller->solution, solution);
-#if GPMPC_ELASTIC
-    solve_elastic(controller);
-#endif
+    solve_local(controller);
+    if (solution->status == GPMPC_INFEASIBLE && !controller->has_plan && !GPMPC_HELD) {
+        /* A line through an obstacle may see it from both of its sides. */
+        follow_inputs(controller);
+        (void)linearize(controller);
+        if (!write_local_problem(controller, covariance, reference))
+            return GPMPC_FUNCTION_NOT_FINITE;
+        solve_local(controller);
+    }
     status = solution->status;
     if (!is_usable(controller))
         return status;
@@ -1540,16 +1564,17 @@ static int decide(gpmpc_controller *controller, const real *state,
     (void)write_rows(problem, reference);
 #endif
 #endif
-    *applicable = status == GPMPC_SOLVED || keeps_hard_rows(problem);
+    *applicable = status == GPMPC_SOLVED || keeps_hard_rows(problem, FEASIBLE);
 #if GPMPC_ROLLS_OUT || !GPMPC_IS_FLOAT
     controller->violation = largest_violation(problem);
 #else
     controller->violation = solution->violation; /* in doubled digits */
 #endif
-    if ((GPMPC_SOFT || GPMPC_SMOOTH) && status == GPMPC_SOLVED
-        && controller->violation > KEPT)
-        return GPMPC_SOFT_BOUND_MISSED;
-    return status;
+    if (status != GPMPC_SOLVED || !(controller->violation > KEPT))
+        return status;
+    if (GPMPC_ROLLS_OUT && !keeps_hard_rows(problem, KEPT))
+        return GPMPC_HARD_BOUND_MISSED;
+    return GPMPC_SOFT || GPMPC_SMOOTH ? GPMPC_SOFT_BOUND_MISSED : status;
 }
 
 /*{filter}*/

@@ -15,7 +15,7 @@ extern "C" {
 #endif
 
 /* How a decision ended. The plan of the first and of GPMPC_SOFT_BOUND_MISSED was
-   applied; of GPMPC_ITERATION_LIMIT, too, where controller.failed is zero. */
+   applied; of the others, too, where controller.failed is zero. */
 enum gpmpc_status {
     GPMPC_SOLVED,
     GPMPC_INFEASIBLE,           /* no plan keeps the hard rows */
@@ -25,7 +25,8 @@ enum gpmpc_status {
     GPMPC_INVALID_MEASUREMENT,  /* what was measured is not finite, or >= 1e30 */
     GPMPC_FUNCTION_NOT_FINITE,  /* a constraint or an output is not */
     GPMPC_SOFT_BOUND_MISSED,    /* solved, but a soft bound is missed */
-    GPMPC_STALLED               /* never: a step takes one program */
+    GPMPC_STALLED,              /* never: a step takes one program */
+    GPMPC_HARD_BOUND_MISSED     /* the program keeps a hard bound, the plan does not */
 };
 
 /* Array sizes; C has no array of none. */

@@ -212,7 +212,9 @@ class Decision:
     disturbance: Array | None = None
     #: whether the solve stopped short of its tolerance, at a limit say, with a plan
     #: that keeps its bounds. It comes from steps towards the optimum, so it is better
-    #: than the guess (Scokaert, Mayne and Rawlings, 1999)
+    #: than the guess (Scokaert, Mayne and Rawlings, 1999). Or whether the program keeps
+    #: a hard bound and its plan, rolled out by the model, does not
+    #: (``HARD_BOUND_MISSED``)
     suboptimal: bool = False
     #: predicted cost of each stage of the plan (H,), that of x_{k+1} and u_k; empty
     #: where it is not known

@@ -40,25 +40,6 @@ NO_PRICE = 1e-9  # of a row that does not count: it keeps its place among the ot
 _TINY = 1e-12
 
 
-def violations(local: LocalProblem, chosen: Array) -> Array:
-    """Returns by how much a plan misses chosen ones of its rows, zero where kept.
-
-    Args:
-        local: With the plan.
-        chosen: Which of the r rows (r,).
-
-    Returns:
-        The violations (H, number of chosen rows).
-    """
-    E, D, lower, upper = local.rows
-    states = local.plan.states[1:]
-    values = np.einsum("kri,ki->kr", _by_stage(E, len(states)), states)
-    if len(D):
-        values = values + np.einsum("krj,kj->kr", D, local.plan.inputs)
-    outside = np.maximum(values - upper, lower - values)
-    return np.maximum(0.0, outside)[:, chosen]
-
-
 class ElasticLimits(NamedTuple):
     """What elastic rows that cannot be kept may cost.
 
@@ -89,7 +70,7 @@ def elastic_limits(
         Q: Weight of the states (n, n), or of those of each stage (H, n, n).
         largest_weight: Of the whole cost, which counts where Q is zero.
     """
-    missed = violations(local, elastic)
+    missed = local.row_violations(elastic)
     gradients = _by_stage(local.rows.E, len(missed))
     gradients = gradients[:, elastic, : Q.shape[-1]]
     n = Q.shape[-1]

@@ -54,7 +54,7 @@ from gpmpc.gaussian import Gaussian, nearest_positive_semidefinite
 from gpmpc.models import RollOut
 from gpmpc.models._past import weighed_dim, weighed_signals
 from gpmpc.mpc._constraints import ConstraintRows, largest_violation
-from gpmpc.mpc._controller import Decision, Request, check_controller
+from gpmpc.mpc._controller import KEPT, Decision, Request, check_controller
 from gpmpc.mpc._cost import PENALIZED, by_stage
 from gpmpc.mpc._linear_quadratic import (
     COVARIANCES,
@@ -72,6 +72,7 @@ from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization, Propagator, differentiate
 from gpmpc.propagation._local_model import expand_belief, square_roots
 from gpmpc.signals import signals_of
+from gpmpc.status import Status
 
 Array = np.ndarray
 
@@ -172,6 +173,24 @@ class LocalProblem(NamedTuple):
         """Returns by how much the plan misses a bound, at most."""
         return largest_violation.unchecked(self.rows, bounds, self.plan, previous_input)
 
+    def row_violations(self, chosen: Array) -> Array:
+        """Returns by how much the plan misses chosen ones of the r rows.
+
+        Args:
+            chosen: Which of them (r,).
+
+        Returns:
+            The violations (H, number of chosen rows), zero where rows are kept.
+        """
+        E, D, lower, upper = self.rows
+        states = self.plan.states[1:]
+        gradients = np.broadcast_to(E, (len(states), *E.shape[1:]))
+        values = np.einsum("kri,ki->kr", gradients, states)
+        if len(D):
+            values = values + np.einsum("krj,kj->kr", D, self.plan.inputs)
+        outside = np.maximum(values - upper, lower - values)
+        return np.maximum(0.0, outside)[:, chosen]
+
 
 class PredictionModel:
     """Linearises plans of one controller; checks that its settings fit the model."""
@@ -265,6 +284,11 @@ class PredictionModel:
         )
         return self.assemble(plan, stages, request)
 
+    def misses_hard_rows(self, local: LocalProblem, limit: float) -> bool:
+        """Returns whether a plan misses a hard row of the states by more than that."""
+        missed = local.row_violations(np.isinf(self.constraints.prices))
+        return not missed.max(initial=0.0) <= limit
+
     def linearize_many(
         self, plans: Sequence[Plan], requests: Sequence[Request]
     ) -> list[LocalProblem]:
@@ -297,6 +321,20 @@ class PredictionModel:
             plan, covariances, self.stage_count, request.parameters, request.kappas
         )
         return LocalProblem(plan, stages, covariances, rows, cost)
+
+    def end_of_solved(self, local: LocalProblem, violation: float) -> Status:
+        """Returns how a decision of a solved program ends: by what its plan misses.
+
+        Args:
+            local: With the plan.
+            violation: By how much the plan misses a bound, at most.
+        """
+        constraints = self.constraints
+        if not violation > KEPT or not constraints.per_stage:
+            return Status.SOLVED
+        if self.misses_hard_rows(local, KEPT):
+            return Status.HARD_BOUND_MISSED
+        return Status.SOFT_BOUND_MISSED
 
     def _covariances_of(
         self, plan: Plan, stages: Stages, cost: QuadraticCost, request: Request

@@ -50,7 +50,7 @@ from gpmpc.mpc._controller import (
     read_parameters,
 )
 from gpmpc.mpc._cost import FunctionNotFinite
-from gpmpc.mpc._elastic import NO_PRICE, TRIALS, elastic_limits, violations
+from gpmpc.mpc._elastic import NO_PRICE, TRIALS, elastic_limits
 from gpmpc.mpc._guess import (
     initial_guess,
     is_contradicted,
@@ -81,7 +81,7 @@ _MOST = 10  # programs of a step, where their number is not set
 _LOOSE = 1e-2  # tolerance there
 _TIGHT = 1e-6  # tolerance where it is set
 _PAYS = 0.7  # of a first plan's cost, below which one that took more programs is taken
-_MISS_RATIO = 1.02  # a plan may miss a curved bound by this times what its program did
+_MISS_RATIO = 1.02  # a plan may miss a bound by this times what its program did
 
 
 class Stopwatch:
@@ -269,12 +269,15 @@ class GPMPC:
                 guess = initial_guess(self.prediction, request)
                 local = self.prediction.linearize(guess, request)
             local = self._at_a_motion(local, request)
-            number_is_open = self.iterations is None and self._most_programs > 1
-            # A curved bound lies elsewhere than one program sees it.
-            may_be_thorough = number_is_open and not self.prediction.constraints.smooth
-            if request.starts_afresh and may_be_thorough:
-                return self._decide_first(local, request, stopwatch)
-            return self._improve(local, request, stopwatch, self._most_programs)
+            if not request.starts_afresh:
+                return self._improve(local, request, stopwatch, self._most_programs)
+            decision = self._decide_first(local, request, stopwatch)
+            if decision.status is Status.INFEASIBLE and not self.prediction.is_held:
+                # A line through an obstacle may see it from both of its sides.
+                motion = motion_of(self.prediction, local.plan, request)
+                local = self.prediction.linearize(motion, request)
+                decision = self._decide_first(local, request, stopwatch, decision)
+            return decision
         except FAILURES as error:
             status = Status.NUMERICAL_TROUBLE
             if isinstance(error, FunctionNotFinite):
@@ -307,13 +310,38 @@ class GPMPC:
         return _ControlStep(self, request, stopwatch, most_programs).run(local)
 
     def _decide_first(
-        self, local: LocalProblem, request: Request, stopwatch: Stopwatch
+        self,
+        local: LocalProblem,
+        request: Request,
+        stopwatch: Stopwatch,
+        failed: Decision | None = None,
     ) -> Decision:
         """Returns a decision without a plan to go on from.
 
-        It is that of one program, unless more of them pay much: one program's first
-        plan need not be consistent yet, and the next decisions lead it further than its
-        horizon shows. A swing-up that is iterated at once may lean for ever.
+        Args:
+            local: The problem at a first guess.
+            request: Of the decision.
+            stopwatch: Likewise.
+            failed: What another guess led to, whose programs count.
+        """
+        number_is_open = self.iterations is None and self._most_programs > 1
+        # A curved bound lies elsewhere than one program sees it.
+        if number_is_open and not self.prediction.constraints.smooth:
+            decision = self._decide_whether_more_pay(local, request, stopwatch)
+        else:
+            decision = self._improve(local, request, stopwatch, self._most_programs)
+        if failed is None:
+            return decision
+        return replace(decision, iterations=decision.iterations + failed.iterations)
+
+    def _decide_whether_more_pay(
+        self, local: LocalProblem, request: Request, stopwatch: Stopwatch
+    ) -> Decision:
+        """Returns a first decision of one program, unless more of them pay much.
+
+        One program's first plan need not be consistent yet, and the next decisions lead
+        it further than its horizon shows. A swing-up that is iterated at once may lean
+        for ever.
         """
         quick = self._improve(local, request, stopwatch, most_programs=1)
         linearizer = self.prediction.linearizer
@@ -333,7 +361,14 @@ class GPMPC:
         )
 
     def _pays(self, thorough: Decision, quick: Decision, request: Request) -> bool:
-        """Returns whether the inputs of a decision cost much less than another's."""
+        """Returns whether a decision is much better than one of a single program.
+
+        Its inputs cost much less, or its plan misses a bound by less that the program
+        had promised to keep.
+        """
+        promised = _MISS_RATIO * quick.program_violation + KEPT
+        if quick.violation > promised:
+            return thorough.violation < quick.violation
         thorough_cost = cost_of_inputs(self.prediction, thorough.inputs, request)
         quick_cost = cost_of_inputs(self.prediction, quick.inputs, request)
         return thorough_cost < _PAYS * quick_cost
@@ -497,9 +532,8 @@ class _ControlStep:
         Each round solves the program of ``local`` and takes its step, which leads to
         the next ``local``. The last round is the one whose program fails, whose step
         says so by a status, or behind which a limit allows no other. Its plan is rolled
-        out where it may not obey the dynamics. Where that misses a curved bound by more
-        than the program promised, one more round starts at the plan that was rolled
-        out.
+        out where it may not obey the dynamics. Where that misses a bound by more than
+        the program promised, one more round starts at the plan that was rolled out.
         """
         guess = local.plan
         while True:
@@ -519,9 +553,12 @@ class _ControlStep:
                 continue
             last_problem = self._end(iterate, local, program)
             status = iterate.status
-            if self._breaks_promise(status, last_problem, solution):
+            is_rolled_out = last_problem is not iterate.local
+            has_moved = iterate.local is not local  # else a program more says the same
+            may_be_mended = is_rolled_out and has_moved
+            if may_be_mended and self._breaks_promise(status, last_problem, solution):
                 if self._may_go_on:
-                    # A curved bound lies elsewhere than the program saw it.
+                    # A bound lies elsewhere than the program saw it.
                     plan = last_problem.plan
                     local = self._prediction.linearize(plan, self._request)
                     continue
@@ -570,7 +607,7 @@ class _ControlStep:
         is_first = self._programs == 0
         if is_first and constraints.any_elastic and solution.status.solved:
             planned = self._planned(program, solution, local)
-            if violations(planned, constraints.elastic).max() > KEPT:
+            if planned.row_violations(constraints.elastic).max() > KEPT:
                 solution = self._solve_elastic(program, solution, local)
         self._programs += 1
         self._warm_start = solution
@@ -786,11 +823,12 @@ class _ControlStep:
     def _breaks_promise(
         self, status: Status | None, ending: LocalProblem, solution: QPSolution
     ) -> bool:
-        """Returns whether a solved plan misses curved bounds by more than its program.
+        """Returns whether a solved plan misses bounds by more than its program.
 
-        A program sees them as they are at the plan before.
+        A program sees curved bounds, and the dynamics that lead to any, as they are at
+        the plan before.
         """
-        if not self._prediction.constraints.smooth:
+        if not self._prediction.constraints.per_stage:
             return False
         if status is None or not status.solved:
             return False
@@ -817,14 +855,14 @@ class _ControlStep:
         plan = local.plan
         suboptimal = False
         if not status.solved:
-            suboptimal = plan is not guess and self._keeps_hard_rows(local)
+            misses = self._prediction.misses_hard_rows(local, FEASIBLE)
+            suboptimal = plan is not guess and not misses
             if not suboptimal:
                 return self._failed_decision(solution, status)
         violation = self._violation(local)
-        constraints = self._prediction.constraints
-        may_be_missed = constraints.soft or constraints.smooth
-        if may_be_missed and status is Status.SOLVED and violation > KEPT:
-            status = Status.SOFT_BOUND_MISSED
+        if status is Status.SOLVED:
+            status = self._prediction.end_of_solved(local, violation)
+            suboptimal = not status.solved
         means, covariances = self._prediction.linearizer.moments(
             plan.states, local.covariances
         )
@@ -855,12 +893,6 @@ class _ControlStep:
         )
         problem = QuadraticProgram._make(solution.arrays)
         return replace(failed, problem=problem, solution=solution)
-
-    def _keeps_hard_rows(self, local: LocalProblem) -> bool:
-        """Returns whether a plan keeps hard rows of the states, nearly."""
-        prices = self._prediction.constraints.prices
-        misses = violations(local, np.isinf(prices))
-        return bool(misses.max(initial=0.0) <= FEASIBLE)
 
     def _novelty(
         self, local: LocalProblem, means: Array, inputs: Array, covariances: Array

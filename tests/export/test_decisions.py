@@ -126,12 +126,14 @@ def tube(penalty, **prediction):
     return gpmpc(problem, **prediction)
 
 
-def obstacle():
+def obstacle(penalty="elastic"):
     """A disc in the plane of the states, and a cost of energy, in CasADi."""
     x = casadi.SX.sym("x", 2)
     u = casadi.SX.sym("u")
     distance = casadi.sqrt((x[0] - 0.5) ** 2 + 0.2 * x[1] ** 2 + 1e-3)
-    apart = Inequality(casadi.Function("h", [x], [0.3 - distance]), probability=0.8)
+    apart = Inequality(
+        casadi.Function("h", [x], [0.3 - distance]), probability=0.8, penalty=penalty
+    )
     energy = casadi.vertcat(casadi.sin(x[0]) + 0.1 * u, x[1] * u)
     output = LeastSquares(casadi.Function("y", [x, u], [energy]), [0.3, 0.1])
     box = Box([-2.0, -np.inf], [2.0, np.inf])
@@ -145,8 +147,9 @@ CONTROLLERS = {
     ),
     "elastic tube": lambda: tube("elastic"),
     "exact tube": lambda: tube("exact"),
-    "hard tube": lambda: tube(None),
+    "hard tube": lambda: tube(None, rolled_out=True),
     "obstacle and energy": obstacle,
+    "hard obstacle": lambda: obstacle(None),
     "velocity form": lambda: gpmpc(Problem(WEIGHTS, TORQUES), form="velocity"),
     "delay, estimate, angles": delayed,
     "disturbance as a state": disturbed,
@@ -205,12 +208,13 @@ def test_every_status_is_met():
         Status.SOLVED,
         Status.INFEASIBLE,
         Status.SOFT_BOUND_MISSED,
+        Status.HARD_BOUND_MISSED,
         Status.INVALID_MEASUREMENT,
     } <= statuses
 
 
 def test_holds_the_input_where_that_is_asked():
-    """Plans that are rolled out miss the hard plane, and count as solved."""
+    """Plans that are rolled out miss the hard plane, and say so."""
     controller = tube(None, rolled_out=True)
     python = ControlLoop(controller, "hold")
     compiled = CompiledLoop(controller, on_failure="hold", compiler=COMPILER)

@@ -11,6 +11,7 @@ from gpmpc.models import KnownModel
 from gpmpc.mpc import (
     GPMPC,
     Box,
+    Halfspaces,
     Inequality,
     PredictionSettings,
     Problem,
@@ -217,3 +218,69 @@ def test_the_first_plan_stands_where_later_programs_fail(monkeypatch):
     decision = controller.control(at, reference)
     assert decision.status is Status.SOLVED
     assert decision.iterations == 1
+
+
+def relaxation(x, u):
+    """A van der Pol oscillator, pushed, 10 Hz."""
+    a, b = x.unbind(-1)
+    return torch.stack(
+        [a + 0.1 * b, b + 0.1 * ((1 - a**2) * b - a + 2 * u[..., 0])], -1
+    )
+
+
+@pytest.mark.parametrize("penalty", [None, "exact"], ids=["hard", "soft"])
+@pytest.mark.parametrize("iterations", [1, None])
+def test_a_plan_rolled_out_beyond_a_bound_says_so(penalty, iterations):
+    """One program sees the bound kept along a line; more programs keep it in truth."""
+    planes = Halfspaces([[1.0, 1.0], [0.0, 1.0]], [0.9, 0.7], penalty=penalty)
+    problem = Problem(
+        Tracking([1.0, 0.1], [0.05], penalized="inputs"),
+        inputs=Box([-2.0], [2.0]),
+        constraints=[planes],
+    )
+    controller = GPMPC(
+        KnownModel(relaxation, 2, 1),
+        Linearization(),
+        problem,
+        10,
+        [0.0],
+        PredictionSettings(covariance="none", rolled_out=True),
+        iterations=iterations,
+    )
+    decision = controller.control(
+        Gaussian.certain([-0.5, 0.0]), Reference(np.array([2.0, 0.0]))
+    )
+    missed = max(0.0, (decision.means[1:] @ planes.F.T - planes.f).max())
+    assert decision.violation == pytest.approx(missed, abs=1e-9)
+    assert decision.applicable
+    if iterations is None:
+        assert decision.status is Status.SOLVED
+        assert missed <= 1e-5
+        return
+    assert missed > 0.1
+    name = "HARD_BOUND_MISSED" if penalty is None else "SOFT_BOUND_MISSED"
+    assert decision.status is Status[name]
+
+
+@pytest.mark.parametrize("iterations", [1, None, 30])
+def test_a_hard_obstacle_on_the_line_to_the_goal_is_no_dead_end(iterations):
+    """The line sees the disc from both sides; the state that stays sees it from one."""
+    disc = Inequality(distance, penalty=None)
+    problem = Problem(
+        Tracking([1.0, 0.1, 1.0, 0.1], [0.1, 0.1], penalized="inputs"),
+        inputs=Box([-1.0] * 2, [1.0] * 2),
+        constraints=[disc],
+    )
+    controller = GPMPC(
+        KnownModel(puck, 4, 2),
+        Linearization(),
+        problem,
+        8,
+        [0.0, 0.0],
+        MEANS,
+        iterations=iterations,
+    )
+    goal = Reference(np.array([2.0, 0.0, 1.0, 0.0]))
+    decision = controller.control(Gaussian.certain(np.zeros(4)), goal)
+    assert decision.applicable
+    assert decision.violation < 1e-3

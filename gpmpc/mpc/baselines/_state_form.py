@@ -29,7 +29,6 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._constraints import ConstraintRows
 from gpmpc.mpc._controller import (
     FEASIBLE,
-    KEPT,
     Decision,
     Reference,
     Request,
@@ -137,8 +136,9 @@ class StateFormMPC:
         violation = planned.violation(
             self.prediction.bounds, request.references.previous_input
         )
-        if status is Status.SOLVED and violation > KEPT:
-            status = Status.SOFT_BOUND_MISSED
+        if status is Status.SOLVED:
+            status = self.prediction.end_of_solved(planned, violation)
+            suboptimal = not status.solved
         return Decision(
             input=inputs[0],
             inputs=inputs,
