@@ -19,7 +19,9 @@ weight does: else a bound in it would count for nothing.
 This is the least price. The linearised program may promise more than the vehicle can
 do: as long as a plan that the model itself rolls out costs at most a SHARE of J0 more,
 the bound may be dearer. Of a few prices up to the exact one the highest such is taken;
-for a first plan, whose guess says little about costs, the least.
+for a first plan, whose guess says little about costs, the least. It is the least, too,
+for what follows on a plan that missed such bounds by more than its program, under the
+exact price, had promised: what the program sees is not what the model does.
 """
 
 from typing import NamedTuple

@@ -520,6 +520,7 @@ class _ControlStep:
         self._most_programs = most_programs
         self._programs = 0  # solved so far
         self._row_prices = self._prediction.constraints.prices
+        self._price_is_due = True  # of elastic rows, by the next program
         self._globalization: Globalization | None = None
         self._squared_lengths: list[float] = []  # of the programs' steps
         self._warm_start: QPSolution | None = None
@@ -561,6 +562,7 @@ class _ControlStep:
                     # A bound lies elsewhere than the program saw it.
                     plan = last_problem.plan
                     local = self._prediction.linearize(plan, self._request)
+                    self._price_is_due = True
                     continue
                 # Who asked for a single program takes the plan as it is.
                 if self._most_programs > 1:
@@ -600,15 +602,18 @@ class _ControlStep:
         """Returns the solution of a program, warm-started from the last one.
 
         Elastic rows that the first program cannot keep get another price, which later
-        programs of the step keep.
+        programs of the step keep. Where a plan has missed them by more than programs
+        under the exact price promised, it is the least one.
         """
         solution = self._solve_priced(program, self._warm_start, self._row_prices)
         constraints = self._prediction.constraints
-        is_first = self._programs == 0
-        if is_first and constraints.any_elastic and solution.status.solved:
+        may_give_way = constraints.any_elastic and self._row_prices is constraints.prices
+        if self._price_is_due and may_give_way and solution.status.solved:
             planned = self._planned(program, solution, local)
             if planned.row_violations(constraints.elastic).max() > KEPT:
                 solution = self._solve_elastic(program, solution, local)
+                self._globalization = None  # it weighs by the price before
+        self._price_is_due = False
         self._programs += 1
         self._warm_start = solution
         return solution
@@ -670,7 +675,8 @@ class _ControlStep:
             Q=self._prediction.problem.cost.Q,
             largest_weight=exact_price / EXACT,
         )
-        if self._request.previous is not None:
+        is_first = self._programs == 0
+        if is_first and self._request.previous is not None:
             free_cost = self._cost_when_followed(program, free_solution, local)
             affordable_cost = free_cost + limits.extra_cost
             if math.isfinite(affordable_cost):
