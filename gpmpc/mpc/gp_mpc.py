@@ -607,7 +607,9 @@ class _ControlStep:
         """
         solution = self._solve_priced(program, self._warm_start, self._row_prices)
         constraints = self._prediction.constraints
-        may_give_way = constraints.any_elastic and self._row_prices is constraints.prices
+        may_give_way = (
+            constraints.any_elastic and self._row_prices is constraints.prices
+        )
         if self._price_is_due and may_give_way and solution.status.solved:
             planned = self._planned(program, solution, local)
             if planned.row_violations(constraints.elastic).max() > KEPT:
