@@ -233,7 +233,9 @@ class Transitions:
 
         Raises:
             SettingError: One name was given where a list of them belongs.
-            DataError: The file or a column is missing, or an entry is no finite number.
+            DataError: The file or a column is missing, an entry is no finite number, or
+                the next states are named in another order than the states, with
+                affixes of their own each.
         """
         _check_name_list("states", states)
         _check_name_list("inputs", inputs)
