@@ -24,6 +24,7 @@ _MOST_RATIOS = 100
 # sensors mark it. Of such numbers even the squares are none.
 _ABSURD = 1e50
 _MISALIGNED = 0.1  # part of errors that no input explains, in deviations, at most
+_MOST_CONFIRMATIONS = 1e6  # for the size of an error
 _PATIENCE = 2  # further confirmations for steps that nothing explained, at most
 
 
@@ -156,8 +157,8 @@ def _put_in_doubt(
     if not _is_frozen(seen, step, expected):
         alone = seen.model.without_points().compare(step)
         new_plant = alone.model.later(1.0)
-        further = int(alone.with_change.largest_square / settings.surprise)
-        confirmations_left += further
+        further = alone.with_change.largest_square / settings.surprise
+        confirmations_left += int(min(further, _MOST_CONFIRMATIONS))
         tries_new_plant = confirmations_left == 1 and _acts_like_input(
             innovation=comparison.planned(seen.active),
             by_input=seen.model.B_inverse @ expected.by_input,
