@@ -147,7 +147,7 @@ class FunctionWriter:
 
 
 def parameter_rows(parameters: Any, horizon: int, count: int) -> np.ndarray:
-    """Returns parameters by stage (H, q) as the code takes them; None are zero.
+    """Returns parameters by stage (H, q) as the code takes them.
 
     Args:
         parameters: (q,) or (H, q), or None.
@@ -156,9 +156,13 @@ def parameter_rows(parameters: Any, horizon: int, count: int) -> np.ndarray:
 
     Raises:
         ShapeError: They are of another number.
+        SettingError: There are none where functions take some.
     """
+    if parameters is None and count:
+        rule = f"must come with every call: the controller's functions take {count}"
+        raise SettingError("parameters", f"{rule}; got none")
     if parameters is None:
-        return np.zeros((horizon, count))
+        return np.zeros((horizon, 0))
     rows = read_parameters(parameters, horizon)
     if rows.shape != (horizon, count):
         rule = f"the controller's functions take {count} parameters a stage"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.exceptions import DataError, ShapeError
+from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.export import CompiledController, CompiledLoop
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
@@ -127,13 +127,13 @@ def tube(penalty, **prediction):
 
 
 def obstacle(penalty="elastic"):
-    """A disc in the plane of the states, and a cost of energy, in CasADi."""
+    """A disc that moves in the plane of the states, and a cost of energy, in CasADi."""
     x = casadi.SX.sym("x", 2)
     u = casadi.SX.sym("u")
-    distance = casadi.sqrt((x[0] - 0.5) ** 2 + 0.2 * x[1] ** 2 + 1e-3)
-    apart = Inequality(
-        casadi.Function("h", [x], [0.3 - distance]), probability=0.8, penalty=penalty
-    )
+    p = casadi.SX.sym("p")
+    distance = casadi.sqrt((x[0] - p) ** 2 + 0.2 * x[1] ** 2 + 1e-3)
+    too_near = casadi.Function("h", [x, u, p], [0.3 - distance])
+    apart = Inequality(too_near, probability=0.8, penalty=penalty)
     energy = casadi.vertcat(casadi.sin(x[0]) + 0.1 * u, x[1] * u)
     output = LeastSquares(casadi.Function("y", [x, u], [energy]), [0.3, 0.1])
     box = Box([-2.0, -np.inf], [2.0, np.inf])
@@ -161,6 +161,9 @@ CONTROLLERS = {
 
 
 LOST = (np.nan, 1e38)  # of a sensor that saw nothing
+# by stage, of those that take some
+PLACES = np.linspace(0.3, 0.7, 6)[:, None]
+PARAMETERS = {"obstacle and energy": PLACES, "hard obstacle": PLACES}
 
 
 def questions(controller, steps, seed=0):
@@ -183,9 +186,10 @@ def test_decides_as_python(name):
     controller = CONTROLLERS[name]()
     python = ControlLoop(controller)
     compiled = CompiledLoop(controller, compiler=COMPILER)
+    parameters = PARAMETERS.get(name)
     for measured, reference in questions(controller, 60):
-        expected = python.input(measured, reference)
-        got = compiled.input(measured, reference)
+        expected = python.input(measured, reference, parameters)
+        got = compiled.input(measured, reference, parameters)
         assert np.abs(got - expected).max() < 1e-9
         assert python.last is not None
         assert (compiled.status, compiled.failed) == (
@@ -349,6 +353,13 @@ def test_states_of_another_size_are_refused():
     ):
         with pytest.raises(ShapeError, match="must have the shape"):
             compiled.input(measured, origin)
+
+
+def test_parameters_come_with_every_call():
+    controller = obstacle()
+    for loop in (ControlLoop(controller), CompiledLoop(controller, compiler=COMPILER)):
+        with pytest.raises(SettingError, match="must come with every call"):
+            loop.input(np.zeros(2), np.zeros(2))
 
 
 def test_references_are_refused_as_python_refuses_them():
