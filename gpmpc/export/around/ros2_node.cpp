@@ -39,8 +39,13 @@ private:
 
     void decide(const Numbers &message)
     {
-        if (!has_reference_ || message.data.size() != GPMPC_MEASURED)
+        if (!has_reference_)
             return;
+        if (message.data.size() != GPMPC_MEASURED) {
+            RCLCPP_WARN(get_logger(), "what is measured has %d numbers",
+                        GPMPC_MEASURED);
+            return;
+        }
         gpmpc_real measured[GPMPC_MEASURED];
         gpmpc_real input[GPMPC_INPUTS];
         for (int i = 0; i < GPMPC_MEASURED; i++)
