@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from time import perf_counter
 from typing import Any
 
@@ -225,6 +226,8 @@ class CompiledController:
         self.source = controller
         self._library = CompiledLibrary(controller, precision, compiler=compiler)
         self._struct = self._library.new_controller()
+        # a call of C lets other threads of Python go on
+        self._is_deciding = Lock()
         self.horizon = controller.horizon
         self.problem = controller.problem
         self.initial_input = controller.initial_input
@@ -244,14 +247,15 @@ class CompiledController:
         """Decides the input for one step; see ``GPMPC.control``."""
         belief = belief.in_order(self.signals.state_names)
         reference = reference.in_order(self.signals)
-        fields = self._struct.fields
-        self._library.reset(self._struct)
-        if previous is not None:
-            _continue(fields, previous)
         followed = self._library.reference(reference, parameters)
-        input = self._step(belief, followed)
-        timing = Timing(solve=self._struct.seconds)
-        return _decision(fields, input, timing)
+        fields = self._struct.fields
+        with self._is_deciding:
+            self._library.reset(self._struct)
+            if previous is not None:
+                _continue(fields, previous)
+            input = self._step(belief, followed)
+            timing = Timing(solve=self._struct.seconds)
+            return _decision(fields, input, timing)
 
     def _step(self, belief: Gaussian, reference: Any) -> Array:
         """Decides the input (m,) from what the code keeps."""

@@ -1,6 +1,7 @@
 """The compiled C decides as Python does."""
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import casadi
@@ -341,6 +342,19 @@ def test_of_another_controllers_decision_the_input_counts():
         assert got.status is expected.status
     with pytest.raises(ShapeError, match="input of the last decision"):
         compiled.control(belief, origin, replace(own, input=np.zeros(2)))
+
+
+def test_a_controller_serves_many_threads():
+    compiled = CompiledController(gpmpc(Problem(WEIGHTS, TORQUES)), compiler=COMPILER)
+    origin = Reference(np.zeros(2))
+    beliefs = [Gaussian.certain([0.005 * k, -0.2]) for k in range(200)]
+
+    def decide(belief):
+        return compiled.control(belief, origin).inputs
+
+    with ThreadPoolExecutor(4) as threads:
+        together = list(threads.map(decide, beliefs))
+    assert (np.array(together) == [decide(belief) for belief in beliefs]).all()
 
 
 def test_states_of_another_size_are_refused():
