@@ -101,6 +101,7 @@ def _fly_job(job: Job) -> None:
         choices=job.choices,
         command=job.settings.command(job.choices),
         folder=job.folder,
+        fingerprint=job.settings.fingerprint(),
     )
     with report_compilation():
         run_one(to_fly, wait=False)

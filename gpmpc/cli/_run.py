@@ -67,6 +67,8 @@ class RunToFly:
     #: that flies it
     command: str
     folder: RunFolder
+    #: of the settings, as a sweep compares them; None where it has none
+    fingerprint: str | None = None
 
 
 @dataclass(frozen=True)
@@ -188,6 +190,7 @@ def run_one(to_fly: RunToFly, wait: bool = True, warn: Warn | None = None) -> Ou
         # The list is filled while the run flies. It stands under provenance, which
         # equal runs need not share: some remarks are made once a process.
         remarks: list[str] = header["provenance"]["remarks"]
+        header["provenance"]["settings_fingerprint"] = to_fly.fingerprint
         try:
             yaml_text = OmegaConf.to_yaml(config, resolve=True)
             folder.begin(yaml_text)

@@ -204,7 +204,7 @@ class Sweep:
         if state is RunState.FAILED:
             return JobOutcome(str(folder), job.folder.error())
         result = job.folder.result()
-        fingerprint = self._compared_fingerprint(job)
+        fingerprint = self._compared_fingerprint(job, result)
         self._add_to_index(folder / METRICS, result, fingerprint)
         self._index.write()
         warning = warning_of(result)
@@ -212,15 +212,16 @@ class Sweep:
             self.warnings[folder] = warning
         return JobOutcome(str(folder))
 
-    def _compared_fingerprint(self, job: Job) -> str | None:
+    def _compared_fingerprint(self, job: Job, result: Mapping[str, Any]) -> str | None:
         """Returns the fingerprint of a job's settings if its finished run has them.
 
         Else None, and a line says so: the file of a model was written anew while the
         sweep flew, or another sweep of other settings finished the run.
         """
         fingerprint = job.settings.fingerprint()
-        if fingerprint is None:
-            return None
+        flown = (result.get("provenance") or {}).get("settings_fingerprint")
+        if fingerprint in (None, flown):
+            return fingerprint
         try:
             settings = plain_settings(job.settings.config(), job.settings.options)
             job.folder.result(settings)

@@ -11,7 +11,7 @@ import hydra
 import pytest
 from rich.console import Console
 
-from gpmpc.cli import _run
+from gpmpc.cli import _run, _sweep
 from gpmpc.cli._chunks import Chunk, Chunking, Job, fly_chunk
 from gpmpc.cli._composing import Composer
 from gpmpc.cli._examples import Examples
@@ -204,12 +204,18 @@ def test_a_sweep_remembers_only_the_settings_that_a_run_has(
         return metrics_of(0.1)
 
     monkeypatch.setattr(_run, "_fly", flight)
+    compared = []
+    resolve = _sweep.plain_settings
+    monkeypatch.setattr(
+        _sweep, "plain_settings", lambda *what: compared.append(what) or resolve(*what)
+    )
     runs = Sweep("run", words, Console(quiet=True))
     job = runs.job(words)
     assert [outcome.error for outcome in runs.fly([job])] == [None]
     path = job.folder.path / "metrics.json"
     known = RunIndex(tmp_path / "tree").record_with(path, job.settings.fingerprint())
     assert (known is not None) == (content == b"1")
+    assert len(compared) == (content == b"2")  # only where it is needed: it takes long
     assert ("of other settings (model.sha256" in capsys.readouterr().err) == (
         content == b"2"
     )
