@@ -326,7 +326,7 @@ COMMANDS = {
             _flag(
                 "--for-control",
                 help="a model to plan with: without the feedback of the controller "
-                "that flew, without delayed inputs",
+                "that flew, a memory of past rows and corrections by them",
             ),
             _flag("--partial", help="read unfinished files as far as they are whole"),
         ],

@@ -19,8 +19,14 @@ from gpmpc._provenance import code_fingerprint, provenance
 from gpmpc.cli._commands import Result
 from gpmpc.cli._folders import find_modules_here, write_files, writing
 from gpmpc.cli._terminal import print_error
+from gpmpc.exceptions import DataError
 from gpmpc.logs import IdentifiedModel, Judgement, Log
-from gpmpc.logs._judging import check_held_out, check_train, most_steps
+from gpmpc.logs._judging import (
+    check_held_out,
+    check_learned,
+    check_train,
+    most_steps,
+)
 from gpmpc.plotting import judgement_figure, png
 from gpmpc.studies._document import Document, Table, number, terminal
 from gpmpc.studies._run_folder import describe_code
@@ -129,6 +135,12 @@ def _learn_and_judge(
             memory=memory,
             for_control=arguments.for_control,
         )
+        try:
+            check_learned(learned, held_out, train)
+        except DataError as error:
+            logs.save_learned(learned, folder / _MODEL)
+            text = f"{error} ({folder / _MODEL} is written, without a report)"
+            raise DataError(text) from error
         longest = min(arguments.steps, most_steps(learned, held_out, train))
         show(f"judging on held-out runs, at most {longest} steps ahead")
         steps = {step for step in _JUDGED_STEPS if step <= longest} | {longest}

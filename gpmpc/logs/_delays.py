@@ -45,8 +45,9 @@ class Delay(NamedTuple):
         """Says that a channel is late; empty where it is not."""
         if abs(self.rows) < 1 and self.highest - self.lowest <= 2:
             return ""
+        side = "before" if self.rows < 0 else "after"
         return (
-            f"{self.later_channel} comes {self.rows:g} rows after {self.channel} "
+            f"{self.later_channel} comes {abs(self.rows):g} rows {side} {self.channel} "
             f"({self.lowest:g} to {self.highest:g}; {self.agreement:.0%} of the blocks "
             "agree)"
         )

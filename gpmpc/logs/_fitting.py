@@ -84,6 +84,9 @@ def fit_nominal(
     check_kind("model", model, LogModel, "a LogModel")
     check_kind("log", log, Log, "a Log of read_log")
     check_number("steps", steps, least=1, whole=True)
+    if isinstance(model.nominal, AffineNominal) and model.nominal.fitted:
+        rule = "must have named parameters; learn fits the weights of an AffineNominal"
+        raise SettingError("model", rule)
     theta0 = np.asarray(model.nominal.start if theta0 is None else theta0, dtype=float)
     count = len(model.nominal.parameter_names)
     if theta0.shape != (count,):

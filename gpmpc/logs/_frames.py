@@ -43,6 +43,8 @@ def with_axes_of_files(mapping: "LogMapping", files: Sequence[Path]) -> "LogMapp
     if mapping.model != "rigid_body" or mapping.axes:
         return mapping
     are_px4 = {file.suffix.lower() == ".ulg" for file in files}
+    if all(signal.axes for signal in mapping.of("states")):
+        return mapping
     if len(are_px4) > 1:
         raise SettingError(
             "frame",

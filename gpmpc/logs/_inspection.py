@@ -40,6 +40,7 @@ from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._read_log import read_log
 from gpmpc.logs._row_times import row_times
 from gpmpc.logs._runs import split_into_runs
+from gpmpc.logs._signals import holds_times, read_column
 
 # columns that hold the time where nobody says which
 TIMES = (STAMP, "timestamp", "t", "time", "stamp", "Time", "seconds")
@@ -383,9 +384,14 @@ def _times_of(
     if named:
         check_column(str(path), table, named)
     else:
+        unit_of_mapping = unit
         named, unit = _usual_time_column(table)
+        if named == "timestamp" and not source.topic:  # as ``read_log`` takes it
+            unit = unit_of_mapping
     if not named:
         return _Times(np.arange(len(table), dtype=float), are_rows=True)
+    if holds_times(table, named):
+        return _Times(read_column(str(path), table, named), column=named)
     stamps = pd.to_numeric(table[named], errors="coerce").to_numpy(float)
     return _Times(stamps * TIME_UNITS[unit], column=named)
 

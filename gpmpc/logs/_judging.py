@@ -32,6 +32,7 @@ from gpmpc.models._windows import Windows
 STEPS = (1, 10, 50)
 LOSING_RATIO = 1.02  # of a baseline's error, from which on a model loses to it
 LEVEL = 0.95
+MOST_OTHER_STEP = 0.05  # of a time step, by which a log's may differ by rounding
 MODEL = "model"  # name of the judged model among the predictors
 _WINDOWS = 1000
 _EXACT = 1e-9  # of a constant state's error
@@ -127,8 +128,8 @@ def judge(
         steps: k, each larger than the one before.
 
     Raises:
-        SettingError: An argument is of another kind, or there is no step, or steps do
-            not increase.
+        SettingError: An argument is of another kind, a log has another time step or
+            other signals than the model, or there is no step, or steps do not increase.
         DataError: No piece of the held-out log is long enough, or none of the train
             log, to which baselines are fitted as many steps ahead.
 
@@ -139,6 +140,9 @@ def judge(
     check_kind("held_out", held_out, Log, "a Log of read_log")
     check_kind("train", train, Log, "a Log of read_log")
     _check_steps(steps)
+    for name, log in (("held_out", held_out), ("train", train)):
+        _check_time_step(name, log, learned)
+        _check_signals(name, log, learned)
     model = learned.model
     space = held_out.space
     windows = held_out.windows(max(steps), max(model.past, PAST), most=_WINDOWS)
@@ -201,7 +205,7 @@ def check_train(train: Log) -> None:
 
 
 def most_steps(learned: IdentifiedModel, held_out: Log, train: Log) -> int:
-    """Returns how many steps ahead a model can be judged, one at least.
+    """Returns how many steps ahead a model can be judged; less than one for none.
 
     A model that looks back on many rows leaves fewer of the held-out ones ahead. The
     baselines beside it are fitted to as many steps of the rows that it was learned
@@ -210,7 +214,66 @@ def most_steps(learned: IdentifiedModel, held_out: Log, train: Log) -> int:
     past = max(learned.model.past, PAST)
     judged = held_out.longest_piece - past - 1
     fitted = train.longest_piece - PAST - 1
-    return max(min(judged, fitted), 1)
+    return min(judged, fitted)
+
+
+def check_learned(learned: IdentifiedModel, held_out: Log, train: Log) -> None:
+    """Raises ``DataError`` of a log that is too short to judge a model on."""
+    if most_steps(learned, held_out, train) >= 1:
+        return
+    past = max(learned.model.past, PAST)
+    names = ", ".join(run.name for run in held_out)
+    raise DataError(
+        f"{names}: the model looks back on {past} rows, so judging it needs {past + 2} "
+        f"rows without a gap; the longest piece that is held out has "
+        f"{held_out.longest_piece}: hold out longer runs"
+    )
+
+
+def _check_time_step(name: str, log: Log, learned: IdentifiedModel) -> None:
+    """Raises ``SettingError`` of a log of another time step than the model.
+
+    Steps ahead, lags and noise are of the rows that it was learned from.
+    """
+    step = learned.time_step
+    if abs(log.time_step - step) > MOST_OTHER_STEP * step:
+        raise SettingError(
+            name,
+            f"must have the model's time step, {step:g} s; got {log.time_step:g} s "
+            f"(rate: {1 / step:g} in the mapping resamples)",
+        )
+
+
+def _check_signals(name: str, log: Log, learned: IdentifiedModel) -> None:
+    """Raises ``SettingError`` of a log of other signals than the model."""
+    own = log.mapping.namings
+    for role, of_log, of_model in (
+        ("states", own.states, learned.namings.states),
+        ("inputs", own.inputs, learned.namings.inputs),
+    ):
+        if of_model and not set(of_log) & set(of_model):
+            raise SettingError(
+                name,
+                f"must have the {role} of the model, {', '.join(of_model[0])}; got "
+                f"{', '.join(of_log[0]) if of_log else 'none'}",
+            )
+    units = _units(log.space)
+    units_of_model = _units(learned.model.kinematics.space)
+    if units != units_of_model:
+        rule = f"must have states of the model's kinds and units, {units_of_model}"
+        raise SettingError(name, f"{rule}; got {units}")
+    contexts = len(log.mapping.column_names("context"))
+    if contexts != len(learned.context_names):
+        raise SettingError(
+            name,
+            f"must have the context of the model, {len(learned.context_names)} "
+            f"columns; got {contexts}",
+        )
+
+
+def _units(space: StateSpace) -> str:
+    """Lists the kind and the unit of each group of states."""
+    return ", ".join(f"{group.kind} [{group.unit}]" for group in space.groups)
 
 
 def _check_steps(steps: Sequence[int]) -> None:

@@ -8,9 +8,12 @@ where they help; and the past may correct the rollouts. What is best is the mode
 noise comes from those rollouts as well.
 """
 
+import hashlib
 from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
@@ -27,6 +30,8 @@ from gpmpc.logs._structures import Candidate, most_reach, past_rows, rows_late
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._namings import NO_NAMINGS, Namings
+
+_ARGUMENTS = "arguments"  # key of a memory: what it holds results of
 
 
 @dataclass(frozen=True)
@@ -80,14 +85,14 @@ def learn(
         seed: Of every random number.
         progress: Called with a line at each stage.
         memory: Holds results of the stages, as plain data: those of an earlier call
-            with equal arguments are not computed again.
+            with equal arguments are not computed again. It begins empty.
         for_control: Leaves out what predicts such runs and misleads a controller: the
             feedback of the controller that flew, a memory of past rows, and the
             correction by the past. Judges what the inputs do.
 
     Raises:
         SettingError: ``log`` is no log, or a setting is out of range, or a model for
-            control has no input.
+            control has no input, or ``memory`` is of other data or settings.
         DataError: No piece of the log is long enough for windows in every fold, even
             of fewer steps.
         TrainingError: A GP could not be trained.
@@ -102,6 +107,10 @@ def learn(
     if for_control and not log.input_names:
         rule = "needs inputs that a controller can set; the mapping names none"
         raise SettingError("for_control", rule)
+    if memory is None:
+        memory = {}
+    check_kind("memory", memory, MutableMapping, "a dictionary")
+    _check_memory(memory, log, (points, steps, seed, for_control))
     advice = "Say kind: angle of it in the mapping"
     warn_of_turns(log.transitions(), log.space.angles, advice)
     reach = most_reach(log, for_control)
@@ -123,11 +132,33 @@ def learn(
         steps=steps,
         seed=seed,
         progress=progress,
-        memory={} if memory is None else memory,
+        memory=memory,
         for_control=for_control,
     )
     search.run()
     return _identify(search, log, folds.sentence, progress, for_control)
+
+
+def _check_memory(
+    memory: MutableMapping[str, Any], log: Log, settings: tuple[int, ...]
+) -> None:
+    """Raises ``SettingError`` of a memory of other data or settings; marks a new one.
+
+    The keys of its results are those of structures alone.
+    """
+    mapping = repr((log.mapping, log.time_step, settings))
+    digest = hashlib.sha256(mapping.encode())
+    for run in log:
+        digest.update(repr((len(run), run.begins)).encode())
+        for values in (run.time, run.states, run.inputs, run.context):
+            digest.update(np.ascontiguousarray(values).tobytes())
+    arguments = digest.hexdigest()
+    if not memory:
+        memory[_ARGUMENTS] = arguments
+    elif memory.get(_ARGUMENTS) != arguments:
+        raise SettingError(
+            "memory", "holds results of other data or settings; pass an empty one"
+        )
 
 
 def _most_steps(log: Log, past: int) -> int:

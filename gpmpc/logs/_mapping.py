@@ -539,6 +539,11 @@ def _read_signals(role: Role, content: Mapping[str, Any]) -> list[Signal]:
         columns = entry.get("columns") or ()
         if isinstance(columns, str | int):
             columns = (columns,)
+        if not isinstance(columns, Sequence):
+            raise SettingError(
+                f"{role}.{name}.columns",
+                f"must be a name, or a list of names; got {columns!r:.200}",
+            )
         columns = tuple(_as_name(column) for column in columns)
         signal = Signal(name=str(name), role=role, **{**entry, "columns": columns})
         if signal.axes and content.get("model") != "rigid_body":
@@ -567,11 +572,14 @@ def _read_ranges(content: Any) -> dict[str, tuple[float, float]]:
 
 def _read_limit(column: str, value: Any) -> float:
     try:
-        return float(value)
+        limit = float(value)
     except (TypeError, ValueError, OverflowError):
+        limit = np.nan
+    if np.isnan(limit):
         raise SettingError(
             f"keep.{column}", f"must be two numbers or null; got {value!r}"
-        ) from None
+        )
+    return limit
 
 
 def _check_keys(key: str, content: Any, known_keys: Sequence[str] | None) -> None:

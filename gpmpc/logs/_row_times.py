@@ -1,4 +1,4 @@
-"""Makes the times of rows that follow each other at a constant step, without stamps."""
+"""Makes the times of rows: of their stamps, or of a constant step without stamps."""
 
 import numpy as np
 import pandas as pd
@@ -7,7 +7,25 @@ from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
 from gpmpc.logs._file import STAMP
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
-from gpmpc.logs._signals import read_column
+from gpmpc.logs._signals import holds_times, read_column
+
+
+def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array:
+    """Reads the times (K,) [s] of rows; NaN where one is missing.
+
+    Args:
+        where: Names the table, for errors.
+        table: Whose rows they are.
+        column: That holds them.
+        unit: Of numbers; dates and durations have their own.
+
+    Raises:
+        DataError: The column is missing, or holds something else.
+    """
+    times = read_column(where, table, column)
+    if holds_times(table, column):
+        return times
+    return times * TIME_UNITS[unit]
 
 
 def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | None:

@@ -18,7 +18,7 @@ from gpmpc.logs._clocks import (
 )
 from gpmpc.logs._file import STAMP, Tables
 from gpmpc.logs._findings import RunFindings
-from gpmpc.logs._mapping import TIME_UNITS, LogMapping, Signal
+from gpmpc.logs._mapping import LogMapping, Signal
 from gpmpc.logs._resampling import (
     Grid,
     Interpolation,
@@ -28,7 +28,7 @@ from gpmpc.logs._resampling import (
     grid_of_rows,
     resample,
 )
-from gpmpc.logs._row_times import row_times
+from gpmpc.logs._row_times import read_times, row_times
 from gpmpc.logs._signals import nan_zero_dropouts, read_column, read_signal
 
 USUAL_GAP = 1.5  # time steps; a longer one is a gap where the mapping names none
@@ -103,7 +103,8 @@ def _read_topic(
         where = f"{where}, {topic}"
     table = _stamped_rows(topic, table, findings)
     hint = ORDER_TOPICS if topic else ORDER_ROWS
-    stamps = ordered_stamps(_read_time(where, table, mapping), where, hint)
+    times = _read_time(topic, where, table, mapping)
+    stamps = ordered_stamps(times, where, hint)
     signals = [signal for signal in mapping.signals if signal.topic == topic]
     ordered = table.iloc[stamps.rows]
     measured = nan_zero_dropouts(where, ordered, signals, findings)
@@ -126,11 +127,12 @@ def _stamped_rows(
     return table[is_stamped]
 
 
-def _read_time(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array:
+def _read_time(
+    topic: str, where: str, table: pd.DataFrame, mapping: LogMapping
+) -> Array:
     """Reads the stamps (K,) [s] of a table, in the order of the file."""
     if mapping.time:
-        unit = TIME_UNITS[mapping.time_unit]
-        return read_column(where, table, mapping.time) * unit
+        return read_times(where, table, mapping.time, mapping.time_unit)
     stamps = row_times(where, table, mapping)
     if stamps is not None:
         return stamps
@@ -140,7 +142,13 @@ def _read_time(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array:
             f"{where}: the mapping names no column of stamps (time: NAME) and no "
             "constant step of the rows (time: {step: 0.1})"
         )
-    return read_column(where, table, column)
+    if topic and mapping.time_unit != "s":
+        raise SettingError(
+            "time.unit",
+            "needs the column that it is of: the stamps of messages are in s; got "
+            f"{mapping.time_unit!r} alone",
+        )
+    return read_times(where, table, column, mapping.time_unit)
 
 
 def _note_stamps(

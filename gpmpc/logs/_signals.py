@@ -6,6 +6,7 @@ by ``_usable_rows``: resampling may go over it, and a row may lack several value
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -18,12 +19,13 @@ from gpmpc.logs._dropouts import sentinels, zero_dropouts
 from gpmpc.logs._findings import RunFindings
 from gpmpc.logs._mapping import Signal
 
-LARGEST_ANGLE = 4 * np.pi  # [rad]; larger ones are rather degrees
+LARGEST_ANGLE = 4 * np.pi  # [rad]; larger ones count turns, or are degrees
+FEWEST_JUMPS = 2  # by more than half a turn: a gap may make one
 NORM_TOLERANCE = 0.05  # of unit quaternions
 
 
 def read_column(where: str, table: pd.DataFrame, column: str) -> Array:
-    """Reads a column of numbers (K,).
+    """Reads a column of numbers (K,); dates and durations are seconds.
 
     Args:
         where: Names the table, for errors.
@@ -35,6 +37,8 @@ def read_column(where: str, table: pd.DataFrame, column: str) -> Array:
     """
     check_column(where, table, column)
     values = table[column]
+    if holds_times(table, column):
+        return _seconds(values)
     numbers = pd.to_numeric(values, errors="coerce").to_numpy(dtype=float)
     is_wrong = np.isnan(numbers) & ~values.isna().to_numpy()
     if is_wrong.any():
@@ -44,6 +48,21 @@ def read_column(where: str, table: pd.DataFrame, column: str) -> Array:
             "expected a number"
         )
     return numbers
+
+
+def holds_times(table: pd.DataFrame, column: str) -> bool:
+    """Tells whether a column holds dates or durations, which have their own unit."""
+    return table[column].dtype.kind in "mM"
+
+
+def _seconds(times: pd.Series) -> Array:
+    """Returns dates, since 1970, or durations (K,) in seconds; NaN for none."""
+    if isinstance(times.dtype, pd.DatetimeTZDtype):
+        times = times.dt.tz_convert(None)
+    values = times.to_numpy()
+    if values.dtype.kind == "M":
+        values = values - np.datetime64(0, "s")
+    return values / np.timedelta64(1, "s")
 
 
 def nan_zero_dropouts(
@@ -96,7 +115,7 @@ def read_signal(
     findings.add("empty sample", absent.sum(), text)
     if signal.kind == "quaternion":
         return _unit_quaternions(where, values, signal, findings)
-    _check_angles(where, values, signal)
+    _check_angles(where, values, signal, findings)
     if signal.kind == "euler":
         return _euler_to_quaternions(values, present=~absent)
     return values
@@ -113,16 +132,31 @@ def _without_sentinels(column: str, numbers: Array, findings: RunFindings) -> Ar
     return np.where(is_sentinel, np.nan, numbers)
 
 
-def _check_angles(where: str, values: Array, signal: Signal) -> None:
-    """Raises ``DataError`` where angles that are said to be radians are too large."""
+def _check_angles(
+    where: str, values: Array, signal: Signal, findings: RunFindings
+) -> None:
+    """Notes angles that are said to be radians and are large: they may be degrees.
+
+    Angles that count turns are as large, but go from row to row by less than half a
+    turn.
+
+    Raises:
+        DataError: They jump more than once, or are a roll or a pitch.
+    """
     if signal.kind not in ("angle", "euler") or signal.unit != "rad":
         return
-    largest = float(np.nanmax(np.abs(values), initial=0.0))
-    if largest > LARGEST_ANGLE:
-        raise DataError(
-            f"{where}: {signal.name} reaches {largest:.4g} rad: are these degrees? "
-            "(unit: deg)"
-        )
+    largest = np.nanmax(np.abs(values), axis=0, initial=0.0)
+    if largest.max() <= LARGEST_ANGLE:
+        return
+    text = (
+        f"{signal.name} reaches {largest.max():.4g} rad: are these degrees? (unit: deg)"
+    )
+    is_tilt = signal.kind == "euler" and largest[:2].max() > LARGEST_ANGLE
+    jumps = (np.abs(np.diff(values, axis=0)) > np.pi).sum()
+    if is_tilt or jumps >= FEWEST_JUMPS:
+        raise DataError(f"{where}: {text}")
+    count = int((np.abs(values) > LARGEST_ANGLE).any(axis=1).sum())
+    findings.add("large angle", count, f"{text} or does it count turns? left in")
 
 
 def _euler_to_quaternions(angles: Array, present: np.ndarray) -> Array:
@@ -130,7 +164,7 @@ def _euler_to_quaternions(angles: Array, present: np.ndarray) -> Array:
     quaternions = np.full((len(angles), 4), np.nan)
     turns = Rotation.from_euler("ZYX", angles[present, ::-1])
     quaternions[present] = turns.as_quat()
-    return quaternions
+    return _with_steady_signs(quaternions).quaternions
 
 
 def _unit_quaternions(
@@ -147,10 +181,30 @@ def _unit_quaternions(
             f"{where}: {signal.name} in row {row + 1} has norm {norms[row]:.4g}; "
             "expected unit quaternions"
         )
-    values = values / norms[:, None]
-    present = np.flatnonzero(np.isfinite(norms))
+    steady = _with_steady_signs(values / norms[:, None])
+    text = f"{steady.flips} times: turned back"
+    findings.add("quaternion flips its sign", steady.flips, text)
+    return steady.quaternions
+
+
+class _SteadySigns(NamedTuple):
+    """Quaternions whose sign does not flip, and how often it did."""
+
+    quaternions: Array  # (K, 4)
+    flips: int
+
+
+def _with_steady_signs(quaternions: Array) -> _SteadySigns:
+    """Gives quaternions (K, 4) signs that do not flip from row to row.
+
+    Opposite ones are one attitude. The scalar of the first is not negative, so that
+    runs that begin alike have the same sign.
+    """
+    values = quaternions.copy()
+    present = np.flatnonzero(np.isfinite(values).all(axis=1))
     flips = np.einsum("ij,ij->i", values[present[1:]], values[present[:-1]]) < 0
-    text = f"{flips.sum()} times: turned back"
-    findings.add("quaternion flips its sign", flips.sum(), text)
-    values[present[1:]] *= np.where(np.cumsum(flips) % 2, -1.0, 1.0)[:, None]
-    return values
+    signs = np.where(np.cumsum(np.r_[False, flips]) % 2, -1.0, 1.0)
+    if len(present) and values[present[0], 3] < 0:
+        signs = -signs
+    values[present] *= signs[: len(present), None]
+    return _SteadySigns(values, int(flips.sum()))

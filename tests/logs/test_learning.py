@@ -22,7 +22,7 @@ from gpmpc.logs import (
     read_log,
     save_learned,
 )
-from gpmpc.logs._judging import most_steps
+from gpmpc.logs._judging import check_learned, most_steps
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._noise import _scales, error_variances, follow_errors
 from gpmpc.logs._output_gps import choose_rows, train_output_gp
@@ -232,6 +232,19 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
     for steps in ((10, 1), (1, 1)):
         with pytest.raises(SettingError, match="steps: must increase"):
             judge(learned, held_out, train, steps=steps)
+    twice = replace(held_out, time_step=2 * held_out.time_step)
+    with pytest.raises(SettingError, match="held_out: must have the model's time step"):
+        judge(learned, twice, train)
+    states = held_out.mapping.signals[:2][::-1]
+    exchanged = replace(
+        held_out.mapping, signals=(*states, *held_out.mapping.signals[2:])
+    )
+    with pytest.raises(SettingError, match="train: must have the states of the model"):
+        judge(learned, held_out, replace(train, mapping=exchanged))
+    short = [replace(run, begins=tuple(range(0, 500, 21))) for run in held_out]
+    needed = max(learned.model.past, 20) + 2
+    with pytest.raises(DataError, match=f"judging it needs {needed} rows"):
+        check_learned(learned, replace(held_out, runs=tuple(short)), train)
     wrong = replace(
         learned, model=replace(learned.model, theta=-learned.model.theta, gps=())
     )
@@ -275,6 +288,10 @@ def test_a_model_is_the_same_after_saving_and_damage_is_named(tmp_path):
         load_learned(tmp_path / "cut.safetensors")
     # What an earlier call has gone through is not done again, and changes nothing.
     again = learn(log, points=40, steps=20, memory=dict(memory))
+    other = replace(log, runs=log.runs[:1])
+    for other_log, points in ((other, 40), (log, 41)):
+        with pytest.raises(SettingError, match="memory: holds results of other data"):
+            learn(other_log, points=points, steps=20, memory=memory)
     np.testing.assert_array_equal(again.model.rollout(windows), expected)
 
 
@@ -434,6 +451,9 @@ def test_misuse_is_named(flights):
         fit_nominal(model, np.zeros(3), log)
     with pytest.raises(DataError, match="the longest has 1500"):
         fit_nominal(model, None, log, steps=3000)
+    affine = replace(model, nominal=AffineNominal(model.kinematics))
+    with pytest.raises(SettingError, match="model: must have named parameters"):
+        fit_nominal(affine, None, log)
     with pytest.raises(SettingError, match="most: must be"):
         log.windows(10, most=0)
     with pytest.raises(SettingError, match="past"):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from gpmpc._angles import wrap
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.logs import LogMapping, read_log
+from gpmpc.logs import LogMapping, inspect_log, read_log
 from gpmpc.logs._runs import split_into_runs
 from gpmpc.models._quaternions import rotate, rotation_quaternion
 from gpmpc.models._state_space import StateGroup, StateSpace
@@ -344,6 +344,47 @@ def test_signals_that_repeat_in_turn_have_a_lower_rate(tmp_path):
             read_log(written(tmp_path, table), BODY)
 
 
+@pytest.mark.parametrize("kind", ["ms", "us", "ns", "zone", "duration"])
+def test_dates_are_times_whatever_their_resolution(tmp_path, kind):
+    table = pendulum_table()
+    durations = pandas.to_timedelta(table["t"], unit="s")
+    dates = pandas.Timestamp("2024-03-01") + durations
+    table["t"] = {
+        "duration": durations.astype("timedelta64[ms]"),
+        "zone": dates.dt.tz_localize("Europe/Berlin"),
+    }.get(kind, dates)
+    if kind in ("ms", "us", "ns"):
+        table["t"] = dates.astype(f"datetime64[{kind}]")
+    table.to_parquet(tmp_path / "log.parquet")
+    log = read_log(tmp_path / "log.parquet", PENDULUM)
+    assert log.time_step == pytest.approx(0.02, abs=1e-6)
+    assert (len(log), kinds(log)) == (400, {})
+    inspection = inspect_log(tmp_path / "log.parquet", time="t")
+    assert inspection.streams.loc[0, "rate [Hz]"] == pytest.approx(50)
+
+
+def test_a_unit_of_times_is_of_the_column_timestamp(tmp_path):
+    table = pendulum_table().rename(columns={"t": "timestamp"})
+    table["timestamp"] *= 1000
+    log = read_log(written(tmp_path, table), {**PENDULUM, "time": {"unit": "ms"}})
+    assert log.time_step == pytest.approx(0.02)
+    inspection = inspect_log(tmp_path / "log.csv", log.mapping)
+    assert inspection.streams.loc[0, "rate [Hz]"] == pytest.approx(50)
+
+
+def test_angles_may_count_turns(tmp_path):
+    table = pendulum_table()
+    table["angle"] = np.linspace(0, 60, 400)
+    angle = {"columns": ["angle"], "kind": "angle", "unit": "rad"}
+    mapping = changed(PENDULUM, "states", "angle", **angle)
+    log = read_log(written(tmp_path, table), mapping)
+    np.testing.assert_allclose(log.runs[0].states[:, 0], table["angle"])
+    assert "does it count turns?" in log.findings[0].text
+    table["angle"] = np.rad2deg(wrap(table["angle"].to_numpy()))
+    with pytest.raises(DataError, match="are these degrees"):
+        read_log(written(tmp_path, table), mapping)
+
+
 @pytest.mark.parametrize("step", [0.01, 1.0])
 def test_slow_and_steady_motion_is_not_rest(tmp_path, step):
     rows = 2000
@@ -382,6 +423,24 @@ def test_parts_at_rest_are_left_out_unless_asked_for(tmp_path):
     assert len(read_log(written(tmp_path, both), {**PENDULUM, "rest": "use"})) == 811
     with pytest.raises(DataError, match="211 of 211 rows where nothing moves"):
         read_log(written(tmp_path, standing), PENDULUM)
+
+
+def test_euler_angles_make_quaternions_without_jumps(tmp_path):
+    table = body_table()
+    yaw = np.linspace(2, 12, 300)
+    table["yaw"] = wrap(yaw)
+    attitude = BODY["states"]["attitude"]
+    euler = {"time": "t", "states": {"attitude": attitude}, "inputs": {"u": ["u"]}}
+    (run,) = read_log(written(tmp_path, table), euler)
+    assert np.abs(np.diff(run.states, axis=0)).max() < 0.1
+    assert run.states[0, 3] >= 0
+    q = Rotation.from_euler("ZYX", table[["yaw", "pitch", "roll"]].to_numpy()).as_quat()
+    table[["qx", "qy", "qz", "qw"]] = q
+    columns = {"columns": ["qx", "qy", "qz", "qw"], "kind": "quaternion"}
+    (other,) = read_log(
+        written(tmp_path, table), {**euler, "states": {"attitude": columns}}
+    )
+    np.testing.assert_allclose(other.states, run.states, atol=1e-12)
 
 
 def test_a_quaternion_whose_sign_flips_is_the_same_attitude(tmp_path):

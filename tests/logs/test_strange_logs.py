@@ -335,6 +335,10 @@ def test_a_time_in_another_unit_is_noted(tmp_path, unit):
     [
         ("keep: 3", "keep: must be keys and values"),
         ("keep: [a]", "keep: must be keys and values"),
+        ("keep: {pz: [.nan, 1]}\nstates: {z: [pz]}", "keep.pz: must be two numbers"),
+        ("states: {z: {columns: 1.5}}", "states.z.columns: must be a name, or a list"),
+        ("states: {z: {columns: {pz: 1}}}", "states.z.columns: must be a name, or"),
+        ("states: {z: {columns: 2024-01-01}}", "states.z.columns: must be a name"),
         ("time: t\ntime: s", "mapping: holds the key 'time' twice"),
     ],
 )
