@@ -114,7 +114,7 @@ def test_a_flight_is_predicted_or_one_line_says_why_not(tmp_path, monkeypatch, c
     # an exported controller is compared with the flight, not only with itself
     monkeypatch.setattr(shutil, "which", lambda name: None)
     arguments |= {"precision": "double", "points": None}
-    arguments |= {"budget": None, "chip": None}
+    arguments |= {"budget": None, "chip": None, "name": "gpmpc"}
     exported = _export.export(argparse.Namespace(**arguments))
     assert 0 <= exported.data["difference_from_flight"] < 1e-6
     said = "was flown by other code: what is exported is what this code makes of"
