@@ -10,11 +10,14 @@ import numpy as np
 
 from gpmpc._angles import full_turns
 from gpmpc._kernels.gp_rollout import Feedback
+from gpmpc.mpc._constraints import price_violations
 from gpmpc.mpc._controller import Request
 from gpmpc.mpc._linear_quadratic import Plan, Stages, evaluate_stages
 from gpmpc.mpc._linearization import LocalProblem, PredictionModel
 
 Array = np.ndarray
+
+_HARD_PRICE = 1e12  # of a hard row where plans are compared, more than any cost
 
 
 def roll_out(
@@ -105,11 +108,13 @@ def cost_when_followed(
 
 
 def cost_of_inputs(
-    prediction: PredictionModel, inputs: Array, request: Request
+    prediction: PredictionModel, inputs: Array, covariances: Array, request: Request
 ) -> float:
-    """Returns what the plan costs that inputs (H, m) lead to.
+    """Returns what the plan costs that inputs (H, m) lead to, with what it misses.
 
-    Each stage's angles count in the turn nearest to its reference.
+    Each stage's angles count in the turn nearest to its reference. Rows of the states,
+    tightened by covariances (H + 1, n, n), count at their prices, hard ones above all;
+    elastic ones do not, whose price is not known before they are missed.
     """
     states = prediction.lead(request.state, inputs, request.disturbance)
     n = prediction.state_dim
@@ -121,7 +126,19 @@ def cost_of_inputs(
     stage_costs = evaluate_stages.unchecked(
         cost, plan.states, inputs, references._replace(states=targets + turns), 1.0
     )
-    return float(stage_costs.sum())
+    total = float(stage_costs.sum())
+    constraints = prediction.constraints
+    if constraints.per_stage and not constraints.elastic.all():
+        rows = constraints.at(
+            plan,
+            np.ascontiguousarray(covariances),
+            prediction.stage_count,
+            request.parameters,
+            request.kappas,
+        )
+        prices = np.where(constraints.elastic, 0.0, constraints.prices)
+        total += price_violations.unchecked(prices, rows, plan, _HARD_PRICE)
+    return total
 
 
 def _follow(

@@ -369,8 +369,12 @@ class GPMPC:
         promised = _MISS_RATIO * quick.program_violation + KEPT
         if quick.violation > promised:
             return thorough.violation < quick.violation
-        thorough_cost = cost_of_inputs(self.prediction, thorough.inputs, request)
-        quick_cost = cost_of_inputs(self.prediction, quick.inputs, request)
+        thorough_cost, quick_cost = (
+            cost_of_inputs(
+                self.prediction, decision.inputs, decision.covariances, request
+            )
+            for decision in (thorough, quick)
+        )
         return thorough_cost < _PAYS * quick_cost
 
     def is_late(self, stopwatch: Stopwatch) -> bool:

@@ -284,3 +284,25 @@ def test_a_hard_obstacle_on_the_line_to_the_goal_is_no_dead_end(iterations):
     decision = controller.control(Gaussian.certain(np.zeros(4)), goal)
     assert decision.applicable
     assert decision.violation < 1e-3
+
+
+@pytest.mark.parametrize("penalty", [None, 1e3, "exact"])
+def test_a_first_plan_whose_inputs_leave_a_bound_is_iterated(penalty):
+    """However little they cost: one program sees them stay inside, along a line."""
+    planes = Halfspaces([[1.0, 1.0], [0.0, 1.0]], [0.9, 0.7], penalty=penalty)
+    problem = Problem(
+        Tracking([1.0, 0.1], [0.05], penalized="inputs"),
+        inputs=Box([-2.0], [2.0]),
+        constraints=[planes],
+    )
+    controller = GPMPC(
+        KnownModel(relaxation, 2, 1), Linearization(), problem, 10, [0.0], MEANS
+    )
+    decision = controller.control(
+        Gaussian.certain([-0.5, 0.0]), Reference(np.array([2.0, 0.0]))
+    )
+    states = [torch.tensor([-0.5, 0.0])]
+    for u in decision.inputs:
+        states.append(relaxation(states[-1], torch.from_numpy(u)))
+    means = torch.stack(states[1:]).numpy()
+    assert (means @ planes.F.T - planes.f).max() < 1e-3
