@@ -349,7 +349,9 @@ class Foresight:
         whole = question.over(length)
         targets = np.asarray(whole.reference.states)
         state = flight.states[0]
-        last = no_plan(question.previous_input, len(state), length)
+        last = no_plan(
+            question.previous_input, len(state), length, question.disturbance
+        )
         angles = controller.prediction.problem.cost.angle_indices
         for _ in range(rounds):
             turns = full_turns(flight.states - targets, angles)
@@ -402,7 +404,9 @@ class _GrowingFlight:
         if self._plan is None:
             n = beginning.states.shape[1]
             horizon = beginning.controller.horizon
-            self._plan = no_plan(self._last_input, n, horizon)
+            self._plan = no_plan(
+                self._last_input, n, horizon, self._question.disturbance
+            )
 
     @property
     def stages(self) -> int:
@@ -470,10 +474,15 @@ def _swings(costs: Array) -> list[int]:
     return stages[:_SWINGS]
 
 
-def no_plan(last_input: Array, state_dim: int, horizon: int) -> Decision:
+def no_plan(
+    last_input: Array,
+    state_dim: int,
+    horizon: int,
+    disturbance: Array | None = None,
+) -> Decision:
     """Returns a decision without a plan.
 
-    What counts of it is the input that was applied.
+    What counts of it are the input that was applied and the estimated disturbance (n,).
     """
     return Decision(
         input=last_input,
@@ -483,4 +492,5 @@ def no_plan(last_input: Array, state_dim: int, horizon: int) -> Decision:
         status=Status.ITERATION_LIMIT,
         iterations=0,
         timing=Timing(),
+        disturbance=disturbance,
     )

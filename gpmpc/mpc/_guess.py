@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gpmpc._angles import state_difference
+from gpmpc._angles import full_turns, state_difference
 from gpmpc._compiled import compiled
 from gpmpc._dynamics import linearize
 from gpmpc.exceptions import SettingError
@@ -67,14 +67,25 @@ def read_request(
     if not request.finite:
         return request
     if prediction.settings.disturbance_gain:
-        disturbance = _estimate_disturbance(prediction, request)
+        disturbance = _estimate_disturbance(prediction, request, previous)
         request = request._replace(disturbance=disturbance)
     if plan is not None and request.guessed_states is None:
         states = prediction.lead(
             request.state, request.guessed_inputs, request.disturbance
         )
         request = request._replace(guessed_states=states)
+        request = _turned_towards(states, request, prediction)
     return request
+
+
+def _turned_towards(
+    states: Array, request: Request, prediction: PredictionModel
+) -> Request:
+    """Returns a request whose references are in the turns of states (H + 1, n)."""
+    targets = request.references.states
+    angles = prediction.problem.cost.angle_indices
+    turned = targets + full_turns(states[1:] - targets, angles)
+    return request._replace(references=request.references._replace(states=turned))
 
 
 def _check_kappas(prediction: PredictionModel, request: Request) -> None:
@@ -85,15 +96,21 @@ def _check_kappas(prediction: PredictionModel, request: Request) -> None:
         raise SettingError("kappas", f"{rule}; this controller has {mode!r}")
 
 
-def _estimate_disturbance(prediction: PredictionModel, request: Request) -> Array:
+def _estimate_disturbance(
+    prediction: PredictionModel, request: Request, last_decision: Decision | None
+) -> Array:
     """Returns d_k (n,); zero without a last decision.
 
     It comes from the estimate of the last decision and from the state that its input
-    led to.
+    led to; where its plan is of no use, the estimate stays as it was.
     """
     previous = request.previous
     if previous is None:
-        return np.zeros(prediction.state_dim)
+        no_estimate = np.zeros(prediction.state_dim)
+        if last_decision is None or last_decision.disturbance is None:
+            return no_estimate
+        known = np.shape(last_decision.disturbance) == no_estimate.shape
+        return np.array(last_decision.disturbance) if known else no_estimate
     last_estimate = previous.disturbance
     if last_estimate is None:
         last_estimate = np.zeros_like(request.state)

@@ -560,7 +560,7 @@ class ManyStarts:
             question.parameters,
             plan=(inputs, means),
         )
-        return _FollowedDecision.of(_with_plan(decision, inputs, means), pursuit)
+        return _FollowedDecision.of(self._with_plan(decision, inputs, means), pursuit)
 
     def _search_flight(
         self, situation: _Situation, question: Question, current: ModelFlight | None
@@ -656,8 +656,28 @@ class ManyStarts:
             means, inputs, gains, situation.state, question
         )
         if self._plan_cost(states, inputs, question) < limit:
-            return _with_plan(decision, inputs, states)
+            return self._with_plan(decision, inputs, states)
         return decision
+
+    def _with_plan(self, decision: Decision, inputs: Array, means: Array) -> Decision:
+        """Returns a decision for another plan, which is applicable."""
+        covariances = decision.covariances
+        if not decision.applicable:
+            covariances = np.zeros((*means.shape, means.shape[1]))
+        changed = replace(
+            decision,
+            input=inputs[0],
+            inputs=inputs,
+            means=means,
+            covariances=covariances,
+            stage_costs=np.empty(0),
+            violation=math.nan,
+            steps=(),
+            plan_novelty=self.controller.novelty_when_read(means, inputs, covariances),
+        )
+        if decision.applicable:
+            return changed
+        return replace(changed, status=Status.ITERATION_LIMIT, suboptimal=True)
 
     def _nearest_turn(self, reference: Reference, end: Array) -> Reference:
         """Returns the turn of a reference whose end is nearest to a state (n,)."""
@@ -727,24 +747,3 @@ def _order(one: ModelFlight, other: ModelFlight) -> int:
 def _without_solution(previous: Decision | None) -> Decision | None:
     """Returns a decision that no solve is warm-started from."""
     return None if previous is None else replace(previous, solution=None)
-
-
-def _with_plan(decision: Decision, inputs: Array, means: Array) -> Decision:
-    """Returns a decision for another plan, which is applicable."""
-    changed = replace(
-        decision,
-        input=inputs[0],
-        inputs=inputs,
-        means=means,
-        stage_costs=np.empty(0),
-        violation=math.nan,
-        steps=(),
-    )
-    if decision.applicable:
-        return changed
-    return replace(
-        changed,
-        status=Status.ITERATION_LIMIT,
-        suboptimal=True,
-        covariances=np.zeros((*means.shape, means.shape[1])),
-    )

@@ -239,7 +239,8 @@ class GPMPC:
                 as where an obstacle will be.
             plan: To start from in the place of the last one: inputs (H, m), or these
                 and states (H + 1, n), which need not obey the dynamics. With states,
-                angles of the reference are taken as they are, turns included.
+                angles of the reference are taken as they are, turns included; with
+                inputs alone, in the turns of the states that these lead to.
 
         Raises:
             ShapeError: Belief, reference, parameters or plan have other dimensions, or
@@ -369,13 +370,15 @@ class GPMPC:
         promised = _MISS_RATIO * quick.program_violation + KEPT
         if quick.violation > promised:
             return thorough.violation < quick.violation
-        thorough_cost, quick_cost = (
-            cost_of_inputs(
-                self.prediction, decision.inputs, decision.covariances, request
-            )
-            for decision in (thorough, quick)
-        )
+        thorough_cost = self._cost_in_truth(thorough, request)
+        quick_cost = self._cost_in_truth(quick, request)
         return thorough_cost < _PAYS * quick_cost
+
+    def _cost_in_truth(self, decision: Decision, request: Request) -> float:
+        """Returns what the plan costs that the inputs of a decision lead to."""
+        return cost_of_inputs(
+            self.prediction, decision.inputs, decision.covariances, request
+        )
 
     def is_late(self, stopwatch: Stopwatch) -> bool:
         """Returns whether a decision has spent its budget."""
@@ -415,6 +418,22 @@ class GPMPC:
             local = next(problems) if request.finite else None
             decisions.append(self._decide(request, Stopwatch(seconds), local))
         return decisions
+
+    def novelty_when_read(
+        self, means: Array, inputs: Array, covariances: Array
+    ) -> float | Callable[[], float]:
+        """Returns what measures the novelty of a plan when called; NaN without GPs.
+
+        Args:
+            means: Of its states (H + 1, n).
+            inputs: (H, m).
+            covariances: Of the states (H + 1, n, n).
+        """
+        if self._scales is None:
+            return math.nan
+        return novelty_when_read(
+            self.prediction.model, means, inputs, covariances, self._scales
+        )
 
     def with_model(self, model: DynamicsModel) -> "GPMPC":
         """Returns the controller for another model of as many states and inputs.
@@ -914,15 +933,11 @@ class _ControlStep:
         Where its stages hold no variances, it is to be measured when it is read.
         """
         scales = self._controller._scales
-        if scales is None:
-            return math.nan
         linearizer = self._prediction.linearizer
-        if linearizer.covariance == "zero_order":
+        if scales is not None and linearizer.covariance == "zero_order":
             V = local.stages.V
             return novelty_of(V, linearizer.noise, covariances, scales)
-        return novelty_when_read(
-            self._prediction.model, means, inputs, covariances, scales
-        )
+        return self._controller.novelty_when_read(means, inputs, covariances)
 
 
 def _check_iterations(iterations: int | None, prediction: PredictionSettings) -> None:

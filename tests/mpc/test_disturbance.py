@@ -226,3 +226,18 @@ def test_a_sensor_may_take_a_turn_off_an_angle_of_the_model(gain):
     expected = steering.control(Gaussian.certain(state), reference, last)
     decision = steering.control(Gaussian.certain(turned), reference, last)
     assert np.allclose(decision.inputs, expected.inputs, rtol=0, atol=1e-9)
+
+
+def test_an_estimate_outlives_a_plan_that_cannot_be_gone_on_from():
+    """As where a search flies the controller on from a state of its model."""
+    mpc = controller(disturbance_gain=0.5)
+    at = Gaussian.certain(np.array([0.4, 0.0]))
+    decision = mpc.control(at, AT_REST)
+    lost = replace(
+        decision,
+        status=Status.INFEASIBLE,
+        suboptimal=False,
+        disturbance=np.array([0.0, 0.08]),
+    )
+    again = mpc.control(at, AT_REST, lost)
+    np.testing.assert_allclose(again.disturbance, [0.0, 0.08], atol=1e-12)

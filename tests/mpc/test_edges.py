@@ -152,3 +152,16 @@ def test_arrays_that_lie_column_by_column_say_the_same(probability):
     by_rows, by_columns = decisions
     assert by_rows.status.solved
     assert np.array_equal(by_columns.inputs, by_rows.inputs)
+
+
+def test_inputs_handed_over_lead_to_the_goal_in_their_turn():
+    """They swing the other way round than the last plan did."""
+    problem = Problem(tracking(angles=[0]), Box([-60.0], [60.0]))
+    controller = cart(problem, horizon=12)
+    goal = Reference(np.array([3.0, 0.0]))
+    last = controller.control(at(0.0, 0.0), goal)
+    assert last.means[-1, 0] > 0.0
+    push = np.zeros((12, 1))
+    push[0] = -40.0
+    decision = controller.control(at(0.0, 0.0), goal, last, plan=push)
+    assert decision.means[-1, 0] < -2.5

@@ -29,6 +29,7 @@ from gpmpc.mpc import (
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from gpmpc.systems import cart_pole, double_pendulum, pendulum, step
+from tests.mpc.small_models import pendulum_posterior
 
 
 def known_model(system):
@@ -581,3 +582,16 @@ def test_plans_are_made_start_by_start_from_any_start_on():
         np.array_equal(a.inputs, b.inputs)
         for (a, _), (b, _) in zip(later, every[2:], strict=True)
     )
+
+
+def test_the_novelty_of_a_followed_flight_is_that_of_its_own_plan():
+    problem = Problem(Tracking([1.0, 0.1], [0.05]), Box([-2.0], [2.0]))
+    controller = GPMPC(pendulum_posterior(), Linearization(), problem, 8, [0.0])
+    decision = ManyStarts(controller).control(
+        Gaussian.certain(np.array([1.5, 0.0])), Reference(np.zeros(2))
+    )
+    measure = controller.novelty_when_read(
+        decision.means, decision.inputs, decision.covariances
+    )
+    assert callable(measure)
+    assert decision.novelty == pytest.approx(measure(), rel=1e-9)
