@@ -22,7 +22,17 @@ from gpmpc.studies._run_record import read_record
 
 ROOT = Path(__file__).resolve().parents[1]
 #: files that no number depends on: how documents look, texts of the command line
-SHOWN_ONLY = {".css", ".ld", ".mplstyle", ".txt", ".typed", ".cpp", ".properties", ""}
+SHOWN_ONLY = {
+    ".css",
+    ".ld",
+    ".mplstyle",
+    ".txt",
+    ".typed",
+    ".cpp",
+    ".ino",
+    ".properties",
+    "",
+}
 
 
 @pytest.fixture
