@@ -424,7 +424,10 @@ def _late_additions(late: int) -> list[Addition]:
     rows = sorted({late, late + 1} | shorter)
     return [
         Addition(
-            f"late:{number}", _late_words(number), _with_delay(number), True, number
+            key=f"late:{number}",
+            words=_late_words(number),
+            extend=_with_delay(number),
+            reach=number,
         )
         for number in rows
     ]
