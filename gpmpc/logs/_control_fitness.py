@@ -25,7 +25,7 @@ _LEAST_EFFECT = 1e-3  # of an output's deviation
 _BLOCK = 50  # rows whose residuals are correlated
 _ROWS = 20_000  # that are looked at, at most
 _STATES = 6  # about which feedbacks are tried
-_DIFFERENCE = 1e-5
+_DIFFERENCE = 1e-5  # of the ranges of states and inputs
 _UNSTABLE = 1.002  # spectral radius
 _DITHER = 0.1  # standard deviation of an excitation over the range of an input
 
@@ -81,7 +81,7 @@ def judge_for_control(
     gains, errors = _gains(model, states, inputs, context, measured)
     slopes = _mean_slopes(model, states, inputs, context)
     deviation = np.maximum(measured.std(axis=0), 1e-12)
-    names = log.input_names
+    names = log.different_input_names
     significance = _significance(gains, errors)
     effects = _effects(model, names, gains, errors, slopes)
     unknown = _unknown_effects(log, inputs, significance)
@@ -180,7 +180,7 @@ def _mean_slopes(
     u = inputs[::every]
     c = context[::every]
     columns = []
-    for h in _DIFFERENCE * np.diag(np.maximum(np.ptp(inputs, axis=0), 1e-6)):
+    for h in _DIFFERENCE * np.diag(_widths(inputs)):
         change = model.outputs(x, u + h, c) - model.outputs(x, u - h, c)
         columns.append(change.mean(axis=0) / (2 * h.sum()))
     return np.stack(columns, axis=-1)
@@ -190,7 +190,7 @@ def _unknown_effects(log: Log, inputs: Array, significance: Array) -> dict[str, 
     """Returns the inputs whose effect the rows cannot tell, with the reason."""
     dependence = input_dependence(log)
     reasons = {}
-    for j, name in enumerate(log.input_names):
+    for j, name in enumerate(log.different_input_names):
         variance = float(inputs[:, j].var())
         if variance <= 1e-20 * max(float(np.square(inputs[:, j]).mean()), 1e-300):
             reasons[name] = f"{name} does not move in the log: its effect is not known"
@@ -211,16 +211,20 @@ def _unknown_effects(log: Log, inputs: Array, significance: Array) -> dict[str, 
 
 def _excitation(log: Log, names: Sequence[str], inputs: Array) -> tuple[str, ...]:
     """Returns what to fly, so that the effects of the inputs can be told."""
-    widths = np.ptp(inputs, axis=0)
-    magnitudes = np.abs(inputs).max(axis=0)
-    widths = np.where(widths > 0, widths, np.where(magnitudes > 0, magnitudes, 1.0))
-    dither = ", ".join(f"{_DITHER * width:.2g}" for width in widths)
+    dither = ", ".join(f"{_DITHER * width:.2g}" for width in _widths(inputs))
     seconds = max(60.0, 500 * log.time_step)
     return (
         f"fly again for {seconds:.0f} s with noise added to the inputs "
         f"({', '.join(names)}), a tenth of the range that each has in this log: "
         f"gpmpc run ... noise.input=[{dither}] steps={seconds / log.time_step:.0f}",
     )
+
+
+def _widths(values: Array) -> Array:
+    """Returns the ranges (c,) of values (K, c): of still ones their size, or one."""
+    ranges = np.ptp(values, axis=0)
+    sizes = np.abs(values).max(axis=0)
+    return np.where(ranges > 0, ranges, np.where(sizes > 0, sizes, 1.0))
 
 
 def _unstable_loops(
@@ -275,20 +279,25 @@ def _regulator(A: Array, B: Array, Q: Array, R: Array) -> Array | None:
 def _linearize(
     model: LogModel, states: Array, inputs: Array, context: Array, time_step: float
 ) -> tuple[Array, Array]:
-    """Linearises one step about states: derivatives (K, e, e) and (K, e, m)."""
+    """Linearises one step about states: derivatives (K, e, e) and (K, e, m).
+
+    They are differences over small parts of the ranges that states and inputs have.
+    """
     space = model.kinematics.space
+    x_steps = _DIFFERENCE * _widths(space.difference(states, states[:1]))
+    u_steps = _DIFFERENCE * _widths(inputs)
 
     def predict(x: Array, u: Array) -> Array:
         return model.kinematics.step(x, model.outputs(x, u, context), time_step)
 
     by_state = []
-    for h in _DIFFERENCE * np.eye(space.error_dim):
+    for h in np.diag(x_steps):
         forward = predict(space.displace(states, h), inputs)
         backward = predict(space.displace(states, -h), inputs)
-        by_state.append(space.difference(forward, backward) / (2 * _DIFFERENCE))
+        by_state.append(space.difference(forward, backward) / (2 * h.sum()))
     by_input = []
-    for h in _DIFFERENCE * np.eye(inputs.shape[1]):
+    for h in np.diag(u_steps):
         forward = predict(states, inputs + h)
         backward = predict(states, inputs - h)
-        by_input.append(space.difference(forward, backward) / (2 * _DIFFERENCE))
+        by_input.append(space.difference(forward, backward) / (2 * h.sum()))
     return np.stack(by_state, axis=-1), np.stack(by_input, axis=-1)

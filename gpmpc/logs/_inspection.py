@@ -536,7 +536,7 @@ def input_dependence(log: Log) -> dict[str, float]:
     features = np.column_stack([np.ones(len(scaled)), scaled, scaled**2])
     weights = np.linalg.lstsq(features, inputs, rcond=1e-8)[0]
     unexplained = (inputs - features @ weights).var(axis=0)
-    return _explained_shares(log.input_names, unexplained, inputs.var(axis=0))
+    return _explained_shares(log.different_input_names, unexplained, inputs.var(axis=0))
 
 
 def _explained_shares(

@@ -82,7 +82,8 @@ def learn(
             fewer take turns.
         points: Rows that a GP is trained on, chosen by k-means.
         steps: Of the rollouts; fewer where the log is too short to be halved for them.
-        seed: Of every random number.
+        seed: Of every random number but those that deal runs to folds, which are the
+            same for all seeds.
         progress: Called with a line at each stage.
         memory: Holds results of the stages, as plain data: those of an earlier call
             with equal arguments are not computed again. It begins empty.

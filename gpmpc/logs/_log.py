@@ -126,6 +126,16 @@ class Log:
         )
 
     @property
+    def different_input_names(self) -> tuple[str, ...]:
+        """Names of the m inputs, with that of their signal where two are equal."""
+        names = self.input_names
+        return tuple(
+            f"{signal.name}.{entry}" if names.count(entry) > 1 else entry
+            for signal in self.mapping.of("inputs")
+            for entry in signal.group.entries
+        )
+
+    @property
     def signals(self) -> Signals:
         """Names of states and inputs, and time step.
 
@@ -170,8 +180,14 @@ class Log:
         )
 
     def split_by_time(self, share: float) -> tuple["Log", "Log"]:
-        """Splits every run: into its first ``share`` of rows, and the others."""
+        """Splits every run: into its first ``share`` of rows, and the others.
+
+        Raises:
+            SettingError: The share is not between zero and one.
+        """
         check_number("share", share, above=0)
+        if share >= 1:
+            raise SettingError("share", f"must be below 1; got {share:g}")
         first = []
         last = []
         for run in self.runs:

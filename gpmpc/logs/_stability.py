@@ -34,8 +34,9 @@ def grows_outside(model: LogModel, input_dim: int, time_step: float) -> bool:
         correction=None,
         start_filter=None,
     )
-    size = model.kinematics.space.dim + linear.carried_dim(input_dim)
-    at_zero = LogLinearizer(linear, input_dim, time_step)(
-        np.zeros((1, size)), np.zeros((1, input_dim)), covariance=False
+    carried = np.zeros(linear.carried_dim(input_dim))
+    origin = np.concatenate([model.kinematics.space.origin, carried])
+    at_origin = LogLinearizer(linear, input_dim, time_step)(
+        origin[None], np.zeros((1, input_dim)), covariance=False
     )
-    return bool(np.abs(np.linalg.eigvals(at_zero.A[0])).max() > 1 + _MARGIN)
+    return bool(np.abs(np.linalg.eigvals(at_origin.A[0])).max() > 1 + _MARGIN)

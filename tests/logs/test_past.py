@@ -22,6 +22,7 @@ from gpmpc.models import LogModel
 from gpmpc.models._kinematics import Increments
 from gpmpc.models._memory import Memory, Products
 from gpmpc.models._parametric import AffineNominal
+from gpmpc.models._state_space import StateGroup, StateSpace
 
 ROWS = Memory(rows=3, decays=(0.8,), output_decays=(0.5,))
 
@@ -173,6 +174,9 @@ def test_products_of_past_rows_learn_a_stiffening_spring():
         force = 0.3 * u[k] - 0.2 * y[k] - 0.4 * y[k] ** 3
         y[k + 1] = y[k] + 0.8 * (y[k] - y[k - 1]) + force
     log = as_log(y[:, None], u[:, None], 1.0)
+    for share in (0.0, 1.0, 1.5):
+        with pytest.raises(SettingError, match="share: must be"):
+            log.split_by_time(share)
     train, held_out = log.split_by_time(0.7)
     low, high = (tuple(f(np.c_[y, u], axis=0).tolist()) for f in (np.min, np.max))
     memory = Memory(rows=1, products=Products(2, 3, low, high))
@@ -186,6 +190,23 @@ def test_products_of_past_rows_learn_a_stiffening_spring():
     assert not grows_outside(model, 1, 1.0)
     pushed = replace(model, weights=model.weights + np.eye(1, model.weights.shape[1]))
     assert grows_outside(pushed, 1, 1.0)
+
+
+def test_attitudes_that_grow_outside_of_their_data_are_seen():
+    space = StateSpace((StateGroup("q", ("x", "y", "z", "w"), kind="quaternion"),))
+    kinematics = Increments(space)
+    products = Products(1, 2, (-1.0,) * 5, (1.0,) * 5)
+    rows = 11 + len(products.factors)  # of features of two rows, of products, of one
+    model = LogModel(
+        kinematics=kinematics,
+        nominal=AffineNominal(kinematics, fitted=False),
+        theta=np.empty(0),
+        history=(0,) * 3,
+        memory=Memory(rows=1, products=products),
+        weights=np.zeros((3, rows)),
+    )
+    assert not grows_outside(model, 1, 1.0)
+    assert grows_outside(replace(model, weights=0.5 * np.eye(3, rows)), 1, 1.0)
 
 
 def test_misuse_of_a_memory_is_named():

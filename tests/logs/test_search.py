@@ -11,7 +11,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.gp import train
 from gpmpc.logs import Log, LogMapping, fit_nominal, judge, learn
 from gpmpc.logs._comparison import compare
-from gpmpc.logs._control_fitness import judge_for_control
+from gpmpc.logs._control_fitness import _linearize, judge_for_control
 from gpmpc.logs._folds import split_folds
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._noise import learning_gains
@@ -482,6 +482,48 @@ def test_a_feedback_that_fails_on_a_rival_is_told():
     fitness = judge_for_control(model, log, {"itself": model, "opposite": opposite})
     (warning,) = fitness.warnings
     assert "'opposite' unstable" in warning
+
+
+class Saturated:
+    parameter_names = ()
+    start = np.empty(0)
+
+    def outputs(self, theta, states, inputs, context):
+        return np.tanh(inputs[..., :1] / 1e-5) - states
+
+
+def test_slopes_are_taken_within_the_range_of_an_input():
+    rng = np.random.default_rng(0)
+    inputs = held_inputs(rng, 200, 2e-6)
+    mapping = LogMapping.from_dict({"states": {"c": ["c"]}, "inputs": {"u": ["u"]}})
+    rates = lambda x, u: Saturated().outputs(None, x, u, None)  # noqa: E731
+    states = simulate(rates, [0.0], inputs)
+    log = log_of([states], [inputs], mapping)
+    model = LogModel(Increments(log.space), Saturated(), np.empty(0), (0,))
+    _, slopes = _linearize(model, states, inputs, np.empty((200, 0)), STEP)
+    expected = STEP * 1e5 / np.cosh(inputs / 1e-5) ** 2
+    np.testing.assert_allclose(slopes[:, :, 0], expected, rtol=1e-4)
+
+
+def test_inputs_of_equal_names_are_told_apart():
+    rng = np.random.default_rng(0)
+    inputs = np.column_stack([held_inputs(rng, 300, 1.0), np.zeros(300)])
+    motors = {side: {"columns": ["u"], "topic": side} for side in ("left", "right")}
+    mapping = LogMapping.from_dict(
+        {
+            "rate": 10,
+            "states": {"c": {"columns": ["c"], "topic": "left"}},
+            "inputs": motors,
+        }
+    )
+    states = simulate(lambda x, u: [u[0] - x[0]], [0.0], inputs)
+    log = log_of([states], [inputs], mapping)
+    theta = np.array([-1.0, 1.0, 0.0, 0.0])
+    model = LogModel(
+        Increments(log.space), AffineNominal(Increments(log.space)), theta, (0,)
+    )
+    (fault,) = judge_for_control(model, log, {}).faults
+    assert fault.startswith("right.u does not move")
 
 
 def test_a_losing_model_says_so_first_and_ends_with_code_3(tmp_path):
