@@ -38,7 +38,7 @@ _TAKEN = frozenset(
         *("iso646", "limits", "locale", "math", "setjmp", "signal", "stdarg"),
         *("stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath"),
         *("time", "wchar", "wctype"),
-        *("all", "check", "clean", "help", "install", "m", "replay", "test"),
+        *("all", "arduino", "check", "clean", "help", "install", "m", "replay", "test"),
     }
 )
 
