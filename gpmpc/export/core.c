@@ -2,6 +2,10 @@
    Small dense algebra. Matrices are rows one after the other, without gaps.
    --------------------------------------------------------------------------------- */
 
+#ifdef __cplusplus
+#define restrict /* a build that takes C for C++ knows none */
+#endif
+
 typedef gpmpc_real real;
 
 /* The sums of GPs are taken in double, or in whole numbers, whatever the precision is:

@@ -109,12 +109,13 @@ BOARD = """
 
 
 @pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
-def test_the_sketch_of_a_board_is_cpp(tmp_path):
+def test_the_sketch_of_a_board_is_cpp_and_the_source_may_be(tmp_path):
+    """Builds for boards, and those of a careless user, take C for C++."""
     export_c(controller_of(), tmp_path, name="arm")
     (tmp_path / "board.h").write_text(BOARD)
     command = ["c++", "-std=c++11", "-fsyntax-only", "-Wall", "-Wextra", "-Werror"]
     sketch = ["-include", "board.h", "-x", "c++", "examples/step_time/step_time.ino"]
-    subprocess.run([*command, "-Isrc", *sketch], cwd=tmp_path, check=True)
+    subprocess.run([*command, "-Isrc", *sketch, "src/arm.c"], cwd=tmp_path, check=True)
 
 
 def test_names_of_signals_end_no_comment(tmp_path):
