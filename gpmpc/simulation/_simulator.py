@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gpmpc._angles import angles_of
-from gpmpc._arrays import read_array
+from gpmpc._arrays import UNMEASURED, is_measured, read_array
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, to_array
 from gpmpc.exceptions import (
@@ -225,13 +225,16 @@ class PlantSimulator:
     def _move_to(self, state: Array, input: Array) -> Diverged | None:
         """Moves to the next state (n,), with noise.
 
-        Returns why the plant cannot go on from there; None where it can. ``input`` is
-        what led there, for the message.
+        Returns why the plant cannot go on from there, such as a state of a size that
+        nothing measures; None where it can. ``input`` is what led there, for the
+        message.
         """
-        if not np.isfinite(state).all():
+        if not is_measured(state).all():
             before = f"it was {self.mean}, input {input}"
             return Diverged(
-                self._steps, f"the plant's state is not finite any more; {before}"
+                self._steps,
+                f"the plant's state is not finite any more, or beyond {UNMEASURED:g}; "
+                f"{before}",
             )
         if getattr(self.plant.dynamics, "ended", False):
             return Diverged(
@@ -352,12 +355,13 @@ class ModelSimulator:
         """Carries the belief one step on; returns why it cannot go on, if so."""
         control = torch.as_tensor(np.asarray(input, dtype=float)).to(self._belief.mean)
         belief = self.loop.propagator(self.loop.model, self._belief, control)
-        mean_is_finite = torch.isfinite(belief.mean).all()
+        mean_is_finite = is_measured(to_array(belief.mean)).all()
         covariance_is_finite = torch.isfinite(belief.covariance).all()
         if not (mean_is_finite and covariance_is_finite):
             return Diverged(
                 self._steps,
-                f"the model's belief is not finite any more; its mean is {belief.mean}",
+                f"the model's belief is not finite any more, or beyond {UNMEASURED:g}; "
+                f"its mean is {belief.mean}",
             )
         self._belief = belief
         self._steps += 1

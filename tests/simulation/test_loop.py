@@ -39,7 +39,7 @@ class HeavyCart(Cart):
 
 class Exploding(Cart):
     def derivative(self, x, u):
-        return [x[1], x[1] * 1e60]
+        return [x[1], x[1] * 1e5]
 
 
 class Feedback:
@@ -335,11 +335,11 @@ def test_a_plant_that_leaves_the_finite_numbers_is_said_so():
     assert caught.value.step == 1
     flown = caught.value.rollout
     assert flown.states[:, 1] == pytest.approx(
-        [1.0, 1e60], rel=1e300
+        [1.0, 1e20 / 24], rel=1e-4
     )  # what was flown before is kept
     assert len(flown.inputs) == 1
     with pytest.raises(Diverged) as caught:
-        fly(plant=System(Exploding(), 1.0, substeps=1), initial=np.array([0.0, 1e300]))
+        fly(plant=System(Exploding(), 1.0, substeps=1), initial=np.array([0.0, 1e29]))
     assert caught.value.rollout is None
 
 
