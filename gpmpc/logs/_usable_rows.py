@@ -8,7 +8,12 @@ begins.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import binary_dilation, maximum_filter1d, minimum_filter1d
+from scipy.ndimage import (
+    binary_dilation,
+    maximum_filter1d,
+    minimum_filter1d,
+    uniform_filter1d,
+)
 
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
@@ -25,6 +30,7 @@ USUAL_MOTION = 0.9  # quantile of the ranges within ``REST_TIME``
 # of the rows; beyond, a signal has another rate than its table. Half of them repeat at
 # half the rate; clocks that drift make it a little less.
 MOST_HELD = 0.45
+MOST_MISSING = 0.5  # of the rows within ``REST_TIME``: of fewer a range says nothing
 SHORT_STEP = 0.5  # time steps; a shorter one is uneven
 LONG_STEP = 1.5  # time steps likewise
 
@@ -48,8 +54,10 @@ def least_motion(states: Sequence[Array], step: float) -> Array:
         raise DataError("no row has a value of every state")
     low, high = np.quantile(present, [0.1, 0.9], axis=0)
     spread = (high - low) / 2
-    ranges = np.concatenate([_ranges_of_rest_time(rows, step) for rows in states])
-    return REST_SHARE * np.minimum(spread, np.quantile(ranges, USUAL_MOTION, axis=0))
+    of_runs = [_ranges_of_rest_time(rows, step) for rows in states]
+    ranges = np.concatenate([*of_runs, spread[None]])  # the spread where all are NaN
+    usual = np.nanquantile(ranges, USUAL_MOTION, axis=0)
+    return REST_SHARE * np.minimum(spread, usual)
 
 
 def select_rows(
@@ -233,7 +241,7 @@ def _note_gaps(
 def _ranges_of_rest_time(states: Array, step: float) -> Array:
     """Returns the ranges of states (K, n) within ``REST_TIME`` around each row."""
     size = min(max(round(REST_TIME / step), 3), len(states))
-    return _range_within(np.nan_to_num(states), size)
+    return _range_within(states, size)
 
 
 def _at_rest(states: Array, inputs: Array, least: Array, step: float) -> np.ndarray:
@@ -245,13 +253,18 @@ def _at_rest(states: Array, inputs: Array, least: Array, step: float) -> np.ndar
     if len(states) < size or not inputs.shape[1]:
         return np.zeros(len(states), dtype=bool)
     limit = np.concatenate([least, np.zeros(inputs.shape[1])])
-    values = np.nan_to_num(np.concatenate([states, inputs], axis=1))
+    values = np.concatenate([states, inputs], axis=1)
     is_still = (_range_within(values, size) <= limit).all(axis=1)
     return binary_dilation(is_still, np.ones(2 * (size // 2) + 1))
 
 
 def _range_within(values: Array, size: int) -> Array:
-    """Returns the range of values (K, c) within ``size`` rows around each."""
-    highest = maximum_filter1d(values, size, axis=0)
-    lowest = minimum_filter1d(values, size, axis=0)
-    return highest - lowest
+    """Returns the range of values (K, c) within ``size`` rows around each.
+
+    Missing values do not count; where more than half are missing, the range is NaN.
+    """
+    is_missing = np.isnan(values)
+    highest = maximum_filter1d(np.where(is_missing, -np.inf, values), size, axis=0)
+    lowest = minimum_filter1d(np.where(is_missing, np.inf, values), size, axis=0)
+    missing = uniform_filter1d(is_missing.astype(float), size, axis=0)
+    return np.where(missing > MOST_MISSING, np.nan, highest - lowest)

@@ -400,6 +400,10 @@ def test_slow_and_steady_motion_is_not_rest(tmp_path, step):
     for state in ("slow", "way"):
         mapping = {"time": "t", "states": {"x": [state]}, "inputs": {"u": ["drive"]}}
         assert len(read_log(written(tmp_path, table), mapping)) == rows
+    with_holes = table.assign(slow=np.where(np.arange(rows) % 40, slow + 9, np.nan))
+    mapping = {"time": "t", "states": {"x": ["slow"]}, "inputs": {"u": ["drive"]}}
+    log = read_log(written(tmp_path, with_holes), mapping)
+    assert kinds(log) == {"empty sample": 50, "missing value": 50}
     standing = pandas.DataFrame(
         {
             "t": step * np.arange(2 * rows),
@@ -407,7 +411,6 @@ def test_slow_and_steady_motion_is_not_rest(tmp_path, step):
             "drive": np.r_[np.zeros(rows), drive],
         }
     )
-    mapping = {"time": "t", "states": {"x": ["slow"]}, "inputs": {"u": ["drive"]}}
     log = read_log(written(tmp_path, standing), mapping)
     assert abs(kinds(log)["at rest"] - rows) < 60
 
