@@ -18,7 +18,7 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
-from gpmpc.mpc._sqp import Globalization
+from gpmpc.mpc._sqp import Globalization, Iterate
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from gpmpc.systems import cart_pole, pendulum, planar_quadrotor, step
@@ -306,3 +306,25 @@ def test_a_first_plan_whose_inputs_leave_a_bound_is_iterated(penalty):
         states.append(relaxation(states[-1], torch.from_numpy(u)))
     means = torch.stack(states[1:]).numpy()
     assert (means @ planes.F.T - planes.f).max() < 1e-3
+
+
+def test_a_step_that_cannot_be_taken_asks_no_further_program(monkeypatch):
+    """Another program from the same plan would say the same."""
+    problem = Problem(
+        Tracking([1.0, 0.1, 1.0, 0.1], [0.1, 0.1], penalized="inputs"),
+        inputs=Box([-1.0] * 2, [1.0] * 2),
+        constraints=[Inequality(h=energy, penalty="exact")],
+    )
+    controller = GPMPC(
+        KnownModel(puck, 4, 2), Linearization(), problem, 8, [0.0, 0.0], MEANS
+    )
+
+    def finds_no_step(self, local, program, solution, proposed):
+        return Iterate(local, Status.SOLVED)
+
+    monkeypatch.setattr(Globalization, "take_step", finds_no_step)
+    decision = controller.control(
+        Gaussian.certain([2.0, 0.0, -2.0, 0.0]), Reference(np.zeros(4))
+    )
+    assert decision.iterations == 2
+    assert decision.status is Status.SOFT_BOUND_MISSED
