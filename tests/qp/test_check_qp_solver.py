@@ -108,5 +108,6 @@ def test_a_solver_ends_with_any_status_but_the_controllers_own():
         Status.INVALID_MEASUREMENT,
         Status.FUNCTION_NOT_FINITE,
         Status.SOFT_BOUND_MISSED,
+        Status.HARD_BOUND_MISSED,
         Status.STALLED,
     }
