@@ -114,7 +114,8 @@ def separate_noise(
 def _with_all_noise(model: GPPosterior | ResidualModel) -> Any:
     """Returns a model with all that was learned, also where it was separated before."""
     if isinstance(model, GPPosterior):
-        return replace(model, noise_variance=model.observation_noise)
+        noise = model.observation_noise
+        return model if noise is None else replace(model, noise_variance=noise)
     residual = _with_all_noise(model.residual)
     if model.observation_noise is None:
         return replace(model, residual=residual)
