@@ -42,16 +42,26 @@ def likely_delay(log: Log, kinematics: Kinematics, most: int) -> int:
     moves = outputs.std(axis=0) > 0
     if not moves.any():
         return 0
-    logarithms = []  # of the residuals' variances, summed over outputs
+    logarithms = []  # of the residuals' variances, by delay
     for rows in range(most + 1):
         inputs = windows.inputs[:, most - rows]
         features = kinematics.features(states, inputs, context)
-        regressors = np.column_stack([np.ones(len(features)), features])
-        solution: Any = np.linalg.lstsq(regressors, outputs[:, moves], rcond=1e-8)[0]
-        residuals = outputs[:, moves] - regressors @ solution
-        exact = 1e-20 * outputs[:, moves].var(axis=0)
-        variances = np.maximum(np.square(residuals).mean(axis=0), exact)
-        logarithms.append(np.log(variances).sum())
+        logarithms.append(_unexplained(features, outputs[:, moves]))
     best = int(np.argmin(logarithms))
     gain = len(outputs) * (logarithms[0] - logarithms[best])
     return best if best < most and gain > _SIGNIFICANT else 0
+
+
+def _unexplained(features: np.ndarray, outputs: np.ndarray) -> float:
+    """Returns the logarithm of what a regression leaves of outputs, summed over them.
+
+    Args:
+        features: Of the rows (N, d).
+        outputs: None of which is constant (N, k).
+    """
+    regressors = np.column_stack([np.ones(len(features)), features])
+    solution: Any = np.linalg.lstsq(regressors, outputs, rcond=1e-8)[0]
+    residuals = outputs - regressors @ solution
+    exact = 1e-20 * outputs.var(axis=0)
+    variances = np.maximum(np.square(residuals).mean(axis=0), exact)
+    return float(np.log(variances).sum())
