@@ -25,7 +25,7 @@ def report_compilation() -> Iterator[None]:
             if not self.started:
                 self.started = True
                 print(
-                    "compiling numerical kernels for about half a minute, once on "
+                    "compiling numerical kernels for up to a minute, once on "
                     "this machine for this kind of controller and model",
                     flush=True,
                 )
