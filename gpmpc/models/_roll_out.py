@@ -181,7 +181,9 @@ class RollOut:
             inputs[:, k] = u
             return self._next_states(states, u) + disturbance
 
-        return iterate(step, start, H), inputs
+        # States that leave the numbers are returned, not warned of.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return iterate(step, start, H), inputs
 
     def _next_states(self, states: Array, inputs: Array) -> Array:
         """Computes the mean of the next states (T, n)."""

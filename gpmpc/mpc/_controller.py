@@ -100,7 +100,7 @@ class Reference:
             raise SettingError("kappas", f"must not be negative; got {self.kappas}")
 
     def _read_names(self) -> None:
-        """Turns series and tables into arrays, whose names are known then."""
+        """Turns tensors, series and tables into arrays; the latter two have names."""
         states = self.signals.state_names or names_of(self.states)
         inputs = self.signals.input_names or names_of(self.inputs)
         signals = Signals(states, inputs) if states or inputs else UNKNOWN
@@ -110,9 +110,13 @@ class Reference:
             ("inputs", signals.input_names),
         ):
             values = getattr(self, key)
-            if values is not None and not hasattr(values, "detach"):
+            if values is None:
+                continue
+            if hasattr(values, "detach"):
+                array = _as_array(values)
+            else:
                 array = read_array(f"reference {key}", values, names)
-                object.__setattr__(self, key, array)
+            object.__setattr__(self, key, array)
 
     def in_order(self, signals: Signals) -> "Reference":
         """Returns the reference, its columns sorted by names, where they are known.

@@ -41,6 +41,14 @@ Penalized = Literal["inputs", "deviations", "increments"]
 PENALIZED = ("inputs", "deviations", "increments")
 
 _WEIGHT_RULE = "must be the diagonal of a weight or a square matrix"
+_PRODUCT_ROUNDING = 1e-12  # of a weight that was computed, such as M.T @ Q @ M
+
+
+class PaidParts(NamedTuple):
+    """What each of K steps cost."""
+
+    states: Array  # (K,)
+    inputs: Array  # (K,)
 
 
 @explains_arguments
@@ -144,6 +152,20 @@ class Tracking:
             SettingError: Deviations are weighed, and no reference inputs were handed
                 over.
         """
+        parts = self.paid_parts(
+            states, inputs, references, previous_input, reference_inputs
+        )
+        return parts.states + parts.inputs
+
+    def paid_parts(
+        self,
+        states: Array,
+        inputs: Array,
+        references: Array,
+        previous_input: Array,
+        reference_inputs: Array | None = None,
+    ) -> PaidParts:
+        """Computes what K steps cost, apart for x_{k+1} and u_k; see ``paid``."""
         Q = self.Q.reshape(-1, *self.Q.shape[-2:])[0]
         R = self.R.reshape(-1, *self.R.shape[-2:])[0]
         error = state_difference(states[1:], references[1:], self.angle_indices)
@@ -155,9 +177,10 @@ class Tracking:
                 rule = "must be handed over where deviations from them are weighed"
                 raise SettingError("reference_inputs", f"{rule}; got None")
             weighed = inputs - reference_inputs
-        costs_of_states = np.einsum("ki,ij,kj->k", error, Q, error)
-        costs_of_inputs = np.einsum("ki,ij,kj->k", weighed, R, weighed)
-        return costs_of_states + costs_of_inputs
+        return PaidParts(
+            states=np.einsum("ki,ij,kj->k", error, Q, error),
+            inputs=np.einsum("ki,ij,kj->k", weighed, R, weighed),
+        )
 
 
 @explains_arguments
@@ -430,10 +453,16 @@ def _weight(key: str, value: Any) -> Array:
         raise SettingError(key, f"{_WEIGHT_RULE}; got {value!r}")
     if not np.isfinite(weight).all():
         raise SettingError(key, f"must be finite; got {value!r}")
-    if not np.allclose(weight, weight.mT, rtol=1e-12, atol=0):
+    largest = np.abs(weight).max(axis=(-2, -1), keepdims=True)
+    sizes = np.sqrt(np.abs(np.diagonal(weight, axis1=-2, axis2=-1)))
+    # No entry of a weight is larger than these, whatever the units of its states.
+    largest_entries = sizes[..., :, None] * sizes[..., None, :]
+    rounding = _PRODUCT_ROUNDING * largest_entries + np.finfo(float).eps * largest
+    if (np.abs(weight - weight.mT) > rounding).any():
         raise SettingError(key, "must be symmetric")
-    lowest = np.linalg.eigvalsh(weight).min()
-    if lowest < -1e-12 * max(1.0, np.abs(weight).max()):
+    eigenvalues = np.linalg.eigvalsh(weight)
+    lowest = eigenvalues.min()
+    if (eigenvalues < -_PRODUCT_ROUNDING * largest[..., 0]).any():
         rule = "must be positive semidefinite"
         raise SettingError(key, f"{rule}; its smallest eigenvalue is {lowest:.3g}")
     return weight

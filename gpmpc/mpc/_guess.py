@@ -27,6 +27,7 @@ from gpmpc.mpc._controller import (
 )
 from gpmpc.mpc._linear_quadratic import Plan, Stages
 from gpmpc.mpc._linearization import PredictionModel
+from gpmpc.mpc._sqp import FAILURES
 
 Array = np.ndarray
 
@@ -102,7 +103,8 @@ def _estimate_disturbance(
     """Returns d_k (n,); zero without a last decision.
 
     It comes from the estimate of the last decision and from the state that its input
-    led to; where its plan is of no use, the estimate stays as it was.
+    led to; where its plan is of no use, or the model has no numbers there, the estimate
+    stays as it was.
     """
     previous = request.previous
     if previous is None:
@@ -115,10 +117,15 @@ def _estimate_disturbance(
     if last_estimate is None:
         last_estimate = np.zeros_like(request.state)
     last_input = request.references.previous_input[None]
-    local = linearize(
-        prediction.model, previous.means[:1], last_input, covariance=False
-    )
+    try:
+        local = linearize(
+            prediction.model, previous.means[:1], last_input, covariance=False
+        )
+    except FAILURES:
+        return last_estimate
     error = state_difference(request.state, local.mean[0], prediction.angles)
+    if not np.isfinite(error).all():
+        return last_estimate
     gain = prediction.settings.disturbance_gain
     return last_estimate + gain * (error - last_estimate)
 

@@ -16,6 +16,7 @@ from gpmpc._dynamics import Array, linearize, to_array
 from gpmpc.gaussian import Gaussian
 from gpmpc.models._past import ModelWithPast, belief_of_all, has_past
 from gpmpc.mpc._controller import Decision, Reference, model_of
+from gpmpc.mpc._sqp import FAILURES
 from gpmpc.signals import signals_of
 
 
@@ -76,14 +77,20 @@ class Situation:
 
     def measured_part(self, decision: Decision | None) -> Decision | None:
         """Returns a decision whose plan is of the states that are measured."""
-        n = self.measured_dim
-        if decision is None or n is None:
+        if self.measured_dim is None:
             return decision
-        return replace(
-            decision,
-            means=np.ascontiguousarray(decision.means[:, :n]),
-            covariances=np.ascontiguousarray(decision.covariances[:, :n, :n]),
-        )
+        return plan_of_first_states(decision, self.measured_dim)
+
+
+def plan_of_first_states(decision: Decision | None, n: int) -> Decision | None:
+    """Returns a decision whose plan is of the first n states."""
+    if decision is None:
+        return None
+    return replace(
+        decision,
+        means=np.ascontiguousarray(decision.means[:, :n]),
+        covariances=np.ascontiguousarray(decision.covariances[:, :n, :n]),
+    )
 
 
 def _state(
@@ -97,7 +104,12 @@ def _state(
     if last_state is None:
         return model.at_rest(measured, last_input) if is_known else None
     if not is_known:
-        local = linearize(model, last_state[None], last_input[None], covariance=False)
+        try:
+            local = linearize(
+                model, last_state[None], last_input[None], covariance=False
+            )
+        except FAILURES:  # where the model has no numbers
+            return None
         return local.mean[0]
     return model.follow(last_state, last_input, measured)
 

@@ -15,7 +15,9 @@ field of it. A policy that asks another controller needs that beside the name; w
 known of the state is ``situation.belief``.
 """
 
+import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from inspect import Parameter, signature
 from typing import Any, Literal, get_args
@@ -46,7 +48,8 @@ from gpmpc.mpc._controller import (
     read_reference,
 )
 from gpmpc.mpc._judgement import FlightJudge, Judgement
-from gpmpc.mpc._past import Situation
+from gpmpc.mpc._past import Situation, plan_of_first_states
+from gpmpc.mpc._sqp import FAILURES
 from gpmpc.mpc.problem import Problem
 from gpmpc.signals import UNKNOWN, signals_of
 from gpmpc.status import Status
@@ -332,7 +335,7 @@ class ControlLoop:
     def _judge_step(
         self, belief: Gaussian, reference: Reference, command: Command
     ) -> Judgement:
-        """Returns the judgement of a command."""
+        """Returns the judgement of a command: of the states that its problem weighs."""
         measured = to_array(belief.mean)
         if self._judge is None:
             self._judge = FlightJudge.of(
@@ -341,7 +344,14 @@ class ControlLoop:
                 input_dim=len(command.input),
             )
         states = np.asarray(reference.states, dtype=float)
-        return self._judge.judge(measured, states, command.decision)
+        decision = command.decision
+        problem = getattr(self.controller, "problem", None)
+        if isinstance(problem, Problem) and problem.state_dim < len(measured):
+            n = problem.state_dim
+            measured = measured[:n]
+            states = states[..., :n]
+            decision = plan_of_first_states(decision, n)
+        return self._judge.judge(measured, states, decision)
 
     def input_between(self, state: Any, share: float) -> np.ndarray:
         """Returns the input to apply until the next decision (m,).
@@ -349,7 +359,8 @@ class ControlLoop:
         It is the plan's, corrected by its feedback, for plants that take inputs more
         often than there is time to decide. The feedback is that of the controller's
         method ``gains``, at the stage of the plan that the time falls into; a late
-        decision goes on along the plan.
+        decision goes on along the plan. Where the last step failed and ``"hold"`` is
+        the policy, it is the input that is held.
 
         Args:
             state: Measured (n,).
@@ -363,19 +374,24 @@ class ControlLoop:
             raise SettingError("input_between", "needs a decision: call input first")
         check_number("share", share, least=0)
         plan = self.last.plan
+        is_held = self.last.failed and self.on_failure == "hold"
         state = read_array("state", state, signals_of(self.controller).state_names)
         n = self._measured_dim
         if n is None:
             n = plan.means.shape[1]
         if state.shape != (n,):
             raise ShapeError(f"state must have shape {(n,)}; got {state.shape}")
+        if is_held:
+            return self.last.input.copy()
         horizon = len(plan.inputs)
         stage = min(int(share), horizon - 1)
         input = plan.inputs[stage]
         if np.isfinite(plan.means).all() and is_measured(state).all():
             planned_state = _state_along(plan.means[:, :n], min(share, horizon))
             error = self._short_way(state - planned_state)
-            input = input - self._gains_of(plan)[stage][:, :n] @ error
+            correction = self._gains_of(plan)[stage][:, :n] @ error
+            if np.isfinite(correction).all():
+                input = input - correction
         last_input = _input_of(self.controller, self._before_last)
         if stage > 0:
             last_input = plan.inputs[stage - 1]
@@ -386,10 +402,11 @@ class ControlLoop:
         if self._gains is None or self._gains[0] is not plan:
             method = getattr(self.controller, "gains", None)
             gains = np.zeros((*plan.inputs.shape, plan.means.shape[1]))
-            if method is not None and self._parameters is None:
-                gains = method(plan)
-            elif method is not None:
-                gains = method(plan, self._parameters)
+            with suppress(*FAILURES):  # then the plan is flown without a feedback
+                if method is not None and self._parameters is None:
+                    gains = method(plan)
+                elif method is not None:
+                    gains = method(plan, self._parameters)
             self._gains = (plan, gains)
         return self._gains[1]
 
@@ -505,6 +522,8 @@ def _continue_last_plan(
         _with_first(plan, inputs, first),
         means=one_step_on(plan.means),
         covariances=one_step_on(plan.covariances),
+        stage_costs=np.empty(0),  # those of the plan before it was shifted
+        violation=math.nan,  # likewise
     )
     return _admit(controller, shifted, last)
 

@@ -6,18 +6,19 @@ of the last program where it was condensed in feedback coordinates, else of the
 regulator of the stages.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from gpmpc._angles import full_turns
 from gpmpc._kernels.gp_rollout import Feedback
-from gpmpc.mpc._constraints import price_violations
-from gpmpc.mpc._controller import Request
-from gpmpc.mpc._linear_quadratic import Plan, Stages, evaluate_stages
+from gpmpc.mpc._controller import KEPT, Request
+from gpmpc.mpc._linear_quadratic import Plan, Stages
 from gpmpc.mpc._linearization import LocalProblem, PredictionModel
 
 Array = np.ndarray
 
-_HARD_PRICE = 1e12  # of a hard row where plans are compared, more than any cost
+MISS_RATIO = 1.02  # a plan that misses a bound by this times another misses it alike
 
 
 def roll_out(
@@ -107,38 +108,82 @@ def cost_when_followed(
     return float(planned.stage_costs(request.references).sum())
 
 
-def cost_of_inputs(
-    prediction: PredictionModel, inputs: Array, covariances: Array, request: Request
-) -> float:
-    """Returns what the plan costs that inputs (H, m) lead to, with what it misses.
+class Outcome(NamedTuple):
+    """What inputs lead to, and what they cost."""
+
+    cost: float  # all are infinite where the inputs lead out of the numbers
+    soft_price: float  # of violated rows with a declared or an exact price
+    hard_miss: float  # the largest violation of a hard row
+
+    def is_much_better_than(self, other: "Outcome", ratio: float) -> bool:
+        """Tells whether it costs less than a ratio of another.
+
+        Hard rows come first, and what violations cost never hides the other costs.
+        """
+        if self.hard_miss < ratio * other.hard_miss:
+            return True
+        if self.hard_miss > MISS_RATIO * other.hard_miss:
+            return False
+        total = self.cost + self.soft_price
+        if total < ratio * (other.cost + other.soft_price):
+            return True
+        misses_no_more = self.soft_price <= MISS_RATIO * other.soft_price
+        return misses_no_more and self.cost < ratio * other.cost
+
+
+def outcome_of_inputs(
+    prediction: PredictionModel,
+    local: LocalProblem,
+    inputs: Array,
+    covariances: Array,
+    request: Request,
+) -> Outcome:
+    """Returns what inputs (H, m) cost in the model, and what the plan misses there.
 
     Each stage's angles count in the turn nearest to its reference. Rows of the states,
-    tightened by covariances (H + 1, n, n), count at their prices, hard ones above all;
+    tightened by covariances (H + 1, n, n), count from where they are no longer kept;
     elastic ones do not, whose price is not known before they are missed.
+
+    Args:
+        prediction: Of the controller.
+        local: A problem of the request, whose stages do not count.
+        inputs: To be judged.
+        covariances: Of the states.
+        request: Of the decision.
     """
-    states = prediction.lead(request.state, inputs, request.disturbance)
+    batch = prediction.roll_out_means.open_loop(
+        request.state[None], inputs[None], request.disturbance
+    )
+    states = batch[0]
+    if not np.isfinite(states).all():
+        return Outcome(cost=np.inf, soft_price=np.inf, hard_miss=np.inf)
     n = prediction.state_dim
     plan = prediction.plan_of(states, inputs, np.zeros((len(states), n, n)))
     references = request.references
     targets = references.states
     turns = full_turns(states[1:] - targets, prediction.problem.cost.angle_indices)
-    cost = prediction.costs.at(plan, request.parameters)
-    stage_costs = evaluate_stages.unchecked(
-        cost, plan.states, inputs, references._replace(states=targets + turns), 1.0
-    )
-    total = float(stage_costs.sum())
-    constraints = prediction.constraints
-    if constraints.per_stage and not constraints.elastic.all():
-        rows = constraints.at(
+    led = local._replace(
+        plan=plan,
+        rows=prediction.constraints.at(
             plan,
             np.ascontiguousarray(covariances),
             prediction.stage_count,
             request.parameters,
             request.kappas,
-        )
-        prices = np.where(constraints.elastic, 0.0, constraints.prices)
-        total += price_violations.unchecked(prices, rows, plan, _HARD_PRICE)
-    return total
+        ),
+        cost=prediction.costs.at(plan, request.parameters),
+    )
+    stage_costs = led.stage_costs(references._replace(states=targets + turns))
+    prices = prediction.constraints.prices
+    hard = np.isinf(prices)
+    soft = ~hard & ~prediction.constraints.elastic
+    soft_misses = (led.row_violations(soft) - KEPT).clip(0.0)
+    hard_misses = (led.row_violations(hard) - KEPT).clip(0.0)
+    return Outcome(
+        cost=float(stage_costs.sum()),
+        soft_price=float((soft_misses @ prices[soft]).sum()),
+        hard_miss=float(hard_misses.max(initial=0.0)),
+    )
 
 
 def _follow(

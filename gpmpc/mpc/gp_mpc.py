@@ -65,7 +65,13 @@ from gpmpc.mpc._linear_quadratic import (
 )
 from gpmpc.mpc._linearization import LocalProblem, PredictionModel, PredictionSettings
 from gpmpc.mpc._novelty import data_scales, novelty_of, novelty_when_read
-from gpmpc.mpc._roll_out import close_defects, cost_of_inputs, cost_when_followed
+from gpmpc.mpc._roll_out import (
+    MISS_RATIO,
+    Outcome,
+    close_defects,
+    cost_when_followed,
+    outcome_of_inputs,
+)
 from gpmpc.mpc._sqp import FAILURES, Globalization, Iterate, measure_continuity
 from gpmpc.mpc._stability import Stability, stability
 from gpmpc.mpc.problem import EXACT, Problem
@@ -81,7 +87,6 @@ _MOST = 10  # programs of a step, where their number is not set
 _LOOSE = 1e-2  # tolerance there
 _TIGHT = 1e-6  # tolerance where it is set
 _PAYS = 0.7  # of a first plan's cost, below which one that took more programs is taken
-_MISS_RATIO = 1.02  # a plan may miss a bound by this times what its program did
 
 
 class Stopwatch:
@@ -352,7 +357,7 @@ class GPMPC:
             return quick
         try:
             thorough = self._improve(local, request, stopwatch, self._most_programs)
-            pays = thorough.applicable and self._pays(thorough, quick, request)
+            pays = thorough.applicable and self._pays(thorough, quick, local, request)
         except FAILURES:  # more programs, or a plan's inputs, led out of its numbers
             return quick
         return replace(
@@ -361,23 +366,30 @@ class GPMPC:
             timing=stopwatch.timing,
         )
 
-    def _pays(self, thorough: Decision, quick: Decision, request: Request) -> bool:
+    def _pays(
+        self,
+        thorough: Decision,
+        quick: Decision,
+        local: LocalProblem,
+        request: Request,
+    ) -> bool:
         """Returns whether a decision is much better than one of a single program.
 
         Its inputs cost much less, or its plan misses a bound by less that the program
         had promised to keep.
         """
-        promised = _MISS_RATIO * quick.program_violation + KEPT
+        promised = MISS_RATIO * quick.program_violation + KEPT
         if quick.violation > promised:
             return thorough.violation < quick.violation
-        thorough_cost = self._cost_in_truth(thorough, request)
-        quick_cost = self._cost_in_truth(quick, request)
-        return thorough_cost < _PAYS * quick_cost
+        outcome = self._outcome(thorough, local, request)
+        return outcome.is_much_better_than(self._outcome(quick, local, request), _PAYS)
 
-    def _cost_in_truth(self, decision: Decision, request: Request) -> float:
-        """Returns what the plan costs that the inputs of a decision lead to."""
-        return cost_of_inputs(
-            self.prediction, decision.inputs, decision.covariances, request
+    def _outcome(
+        self, decision: Decision, local: LocalProblem, request: Request
+    ) -> Outcome:
+        """Returns what the inputs of a decision lead to in the model."""
+        return outcome_of_inputs(
+            self.prediction, local, decision.inputs, decision.covariances, request
         )
 
     def is_late(self, stopwatch: Stopwatch) -> bool:
@@ -864,7 +876,7 @@ class _ControlStep:
         if status is None or not status.solved:
             return False
         promised = float(solution.violation().max(initial=0.0))
-        return self._violation(ending) > _MISS_RATIO * promised + KEPT
+        return self._violation(ending) > MISS_RATIO * promised + KEPT
 
     def _violation(self, local: LocalProblem) -> float:
         """Returns by how much a plan misses a bound, at most."""

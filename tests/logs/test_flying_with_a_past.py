@@ -177,6 +177,17 @@ def test_a_loop_of_ones_own_keeps_it_as_well():
     assert pushed < expected
 
 
+def test_a_loop_that_is_told_the_whole_state_judges_what_its_problem_weighs():
+    model = dynamics()
+    loop = ControlLoop(controller(model))
+    goal = model.at_rest(GOAL, np.zeros(1))
+    told = model.at_rest(np.zeros(2), np.zeros(1))
+    measured = ControlLoop(controller(model)).input(np.zeros(2), GOAL)
+    assert loop.input(told, goal) == pytest.approx(measured)
+    assert loop.judgement is not None
+    assert loop.judgement.level == "healthy"
+
+
 def test_a_loop_corrects_between_steps_whatever_was_measured():
     loop = ControlLoop(controller(dynamics()))
     start = np.zeros(2)

@@ -1,13 +1,14 @@
 """An iteration says that it has arrived, takes as many programs as it needs, and hands
 out what it says."""
 
+import casadi
 import numpy as np
 import pytest
 import torch
 
 from gpmpc.exceptions import DataError
 from gpmpc.gaussian import Gaussian
-from gpmpc.models import KnownModel
+from gpmpc.models import CasadiFunction, KnownModel
 from gpmpc.mpc import (
     GPMPC,
     Box,
@@ -18,6 +19,8 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
+from gpmpc.mpc._guess import initial_guess, read_request
+from gpmpc.mpc._roll_out import Outcome, outcome_of_inputs
 from gpmpc.mpc._sqp import Globalization, Iterate
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
@@ -203,6 +206,92 @@ def test_a_first_plan_is_iterated_only_where_that_pays():
         assert plans[0].applicable
     assert ends[pendulum] < 1e-9
     assert ends[cart_pole] > 0.1
+
+
+@pytest.mark.parametrize("weight", [0.0, 1e-4])
+def test_a_bound_that_no_plan_keeps_does_not_hide_what_pays(weight):
+    """A cart-pole beside a load that is too heavy for an exact bound, whatever is
+    done."""
+    system = cart_pole()
+    x = casadi.SX.sym("x", 5)
+    u = casadi.SX.sym("u", 1)
+    successor = casadi.vertcat(*system.successor(x[:4], u), x[4])
+    function = casadi.Function("f", [x, u], [successor])
+    model = KnownModel(CasadiFunction(function), 5, 1)
+    cost = Tracking(
+        [1.0, 0.01, 1.0, 0.01, 0.0],
+        [0.01],
+        penalized="inputs",
+        angles=system.angle_indices,
+    )
+    load = Box(None, [np.inf] * 4 + [1.0], penalty="exact")
+    problem = Problem(cost, Box(system.input_lower, system.input_upper), None, [load])
+    start = np.append(system.start, 1.0 + weight)
+    plans = []
+    for count in (None, 1):
+        controller = GPMPC(
+            model, Linearization(), problem, 30, [0.0], MEANS, iterations=count
+        )
+        plan = controller.control(Gaussian.certain(start), Reference(np.zeros(5)))
+        assert plan.violation == pytest.approx(weight)
+        plans.append(plan)
+    assert plans[0].cost < 0.5 * plans[1].cost
+
+
+def test_violations_and_costs_of_first_plans_are_compared_apart():
+    cheap = Outcome(cost=1.0, soft_price=0.0, hard_miss=0.0)
+    dear = Outcome(cost=10.0, soft_price=0.0, hard_miss=0.0)
+    beyond = cheap._replace(hard_miss=0.1)
+    further = cheap._replace(hard_miss=0.3)
+    lost = Outcome(cost=np.inf, soft_price=np.inf, hard_miss=np.inf)
+    assert cheap.is_much_better_than(dear, 0.7)
+    assert not dear.is_much_better_than(cheap, 0.7)
+    assert not beyond.is_much_better_than(dear, 0.7)
+    assert dear.is_much_better_than(beyond, 0.7)
+    assert beyond.is_much_better_than(further, 0.7)
+    assert beyond.is_much_better_than(lost, 0.7)
+    assert not lost.is_much_better_than(dear, 0.7)
+    assert not lost.is_much_better_than(lost, 0.7)
+    priced = [outcome._replace(soft_price=1e6) for outcome in (cheap, dear)]
+    assert priced[0].is_much_better_than(priced[1], 0.7)
+    assert not priced[0]._replace(soft_price=2e6).is_much_better_than(dear, 0.7)
+
+
+def test_inputs_that_lead_out_of_the_numbers_are_no_cheap_plan():
+    """A cubic spring that pushes away: open loop, inputs beyond it diverge."""
+    model = KnownModel(lambda x, u: x + x**3 + u, 1, 1)
+    problem = Problem(Tracking([1.0], [1e-3]), inputs=Box([-9.0], [9.0]))
+    controller = GPMPC(model, Linearization(), problem, 20, [0.0], MEANS)
+    prediction = controller.prediction
+    request = read_request(
+        prediction, Gaussian.certain([1.0]), Reference(np.zeros(1)), None
+    )
+    local = prediction.linearize(initial_guess(prediction, request), request)
+    outcomes = [
+        outcome_of_inputs(prediction, local, inputs, np.zeros((21, 1, 1)), request)
+        for inputs in (np.full((20, 1), 9.0), np.append(-2.0, np.zeros(19))[:, None])
+    ]
+    assert outcomes[0].cost == np.inf
+    assert outcomes[1].cost == pytest.approx(0.008)  # of two increments
+    assert outcomes[1].is_much_better_than(outcomes[0], 0.7)
+
+
+def test_a_hard_bound_missed_by_rounding_is_kept_in_what_inputs_lead_to():
+    model = KnownModel(lambda x, u: x + u, 1, 1)
+    wall = Box(None, [1.0], penalty=None)
+    problem = Problem(Tracking([1.0], [1e-3]), constraints=[wall])
+    controller = GPMPC(model, Linearization(), problem, 5, [0.0], MEANS)
+    prediction = controller.prediction
+    request = read_request(
+        prediction, Gaussian.certain([0.0]), Reference(np.zeros(1)), None
+    )
+    local = prediction.linearize(initial_guess(prediction, request), request)
+    for excess, miss in ((1e-9, 0.0), (0.25, 0.25 - 1e-5)):
+        inputs = np.array([[1.0 + excess], [0.0], [0.0], [0.0], [0.0]])
+        outcome = outcome_of_inputs(
+            prediction, local, inputs, np.zeros((6, 1, 1)), request
+        )
+        assert outcome.hard_miss == pytest.approx(miss)
 
 
 def test_the_first_plan_stands_where_later_programs_fail(monkeypatch):

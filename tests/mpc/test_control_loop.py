@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import torch
 
 from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.models import KnownModel
@@ -132,3 +133,93 @@ def test_a_sensors_mark_of_nothing_costs_one_step(form, mark):
         x = next_state(x, u)
     assert loop.failures == 1
     assert loop.judgement.level == "healthy"
+
+
+@pytest.mark.parametrize("on_failure", ["previous_plan", "hold"])
+def test_what_is_held_stays_held_between_decisions(on_failure):
+    loop = ControlLoop(controller(), on_failure)
+    x = np.zeros(2)
+    for _ in range(3):
+        x = next_state(x, loop.input(x, GOAL))
+    held = loop.input([np.nan, 0.0], GOAL)
+    assert loop.last.failed
+    plan = loop.last.plan
+    behind = plan.means[1] - 0.2
+    between = np.ravel([loop.input_between(behind, k) for k in (0.5, 1.0, 2.5)])
+    if on_failure == "hold":
+        assert between == pytest.approx(held[0])
+    else:
+        assert np.ptp(between) > 0.01
+    loop.input(x, GOAL)
+    planned = loop.last.plan.means[0]
+    assert loop.input_between(planned, 0.0) == pytest.approx(loop.last.input)
+    assert not np.allclose(loop.input_between(planned - 0.2, 0.0), loop.last.input)
+
+
+def test_what_the_policy_goes_on_along_costs_and_misses_nothing_that_is_known():
+    loop = ControlLoop(controller())
+    loop.input(np.zeros(2), GOAL)
+    solved = loop.last.plan
+    assert len(solved.stage_costs) == 10
+    assert np.isfinite(solved.violation)
+    loop.input([np.nan, 0.0], GOAL)
+    assert len(loop.last.plan.stage_costs) == 0
+    assert np.isnan(loop.last.plan.violation)
+
+
+@pytest.mark.parametrize("gains", [np.nan, None])
+def test_without_gains_the_plan_is_flown_between_decisions(gains):
+    class WithoutGains(GPMPC):
+        def gains(self, decision, parameters=None):
+            if gains is None:
+                raise np.linalg.LinAlgError("singular")
+            return np.full((10, 1, 2), gains)
+
+    loop = ControlLoop(WithoutGains(model(), Linearization(), PROBLEM, 10, [0.0]))
+    loop.input(np.zeros(2), GOAL)
+    between = loop.input_between(np.array([0.1, 0.0]), 0.5)
+    assert between == pytest.approx(loop.last.plan.inputs[0])
+
+
+def test_a_reference_may_be_a_tensor_of_a_graph():
+    loops = [ControlLoop(controller()), ControlLoop(controller())]
+    goal = torch.tensor(GOAL, requires_grad=True)
+    along = torch.tensor(np.tile(GOAL, (11, 1)), requires_grad=True)
+    for of_graph, plain in ((goal, GOAL), (along, np.tile(GOAL, (11, 1)))):
+        ours = loops[0].input(np.zeros(2), Reference(of_graph))
+        assert ours == pytest.approx(loops[1].input(np.zeros(2), plain))
+        assert loops[0].judgement == loops[1].judgement
+
+
+def test_an_error_of_the_numbers_of_the_estimate_costs_no_input():
+    class Fails:
+        """Fails at states that were flown through."""
+
+        dtype = torch.float64
+        device = torch.device("cpu")
+        state_dim = output_dim = 2
+        input_dim = 1
+        noise_covariance = torch.zeros(2, 2)
+
+        def __init__(self):
+            self.inner = model()
+            self.is_broken = False
+
+        def predict(self, state, input=None):
+            if self.is_broken and len(state) == 1:
+                raise torch.linalg.LinAlgError("singular")
+            return self.inner.predict(state, input)
+
+    fails = Fails()
+    settings = PredictionSettings(disturbance_gain=0.5)
+    steering = GPMPC(fails, Linearization(), PROBLEM, 10, [0.0], settings)
+    loop = ControlLoop(steering)
+    x = np.zeros(2)
+    for _ in range(3):
+        x = next_state(x, loop.input(x, GOAL)) + np.array([0.0, 0.05])
+    estimate = loop.last.decision.disturbance
+    assert np.abs(estimate).max() > 0.01
+    fails.is_broken = True
+    loop.input(x, GOAL)
+    assert loop.failures == 0
+    assert loop.last.decision.disturbance == pytest.approx(estimate)

@@ -172,5 +172,21 @@ def test_a_weight_may_be_skew_by_round_off_and_no_more(skew):
                 Tracking(weight, [1.0])
 
 
+def test_a_weight_that_was_computed_is_symmetric_but_for_rounding_of_its_sums():
+    # Sums that cancel leave other digits on both sides, as of M.T @ Q @ M.
+    weight = np.array([[0.5, 1e-17], [2e-17, 1.6]])
+    assert np.array_equal(Tracking(weight, [1.0]).Q, weight)
+    # States of other units: an entry of one is off by a tenth.
+    skew = np.array([[1e10, 0.5], [0.6, 1e-10]])
+    with pytest.raises(SettingError, match="Q: must be symmetric"):
+        Tracking(skew, [1.0])
+
+
+@pytest.mark.parametrize("unit", [1e-13, 1.0, 1e13])
+def test_a_negative_weight_is_refused_in_any_unit(unit):
+    with pytest.raises(SettingError, match="Q: must be positive semidefinite"):
+        Tracking([unit, -0.5 * unit], [1.0])
+
+
 def test_stages_may_be_an_array():
     assert Box([-1.0], [1.0], stages=np.arange(2, 5)).stages == (2, 3, 4)
