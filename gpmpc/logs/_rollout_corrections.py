@@ -6,6 +6,11 @@ and step: each run, or block of one, is corrected by what the others say. The be
 comes first, then, one by one, that with which the mean is best (Caruana et al., 2004,
 Ensemble selection from libraries of models).
 
+Regressions that keep nothing of a rollout need none. They are fitted to windows of all
+rows, at each step to all that reach so far, and not to those of held-out blocks, which
+end where a block ends: of short blocks these are half of all, and what is fitted to
+them loses to the baseline.
+
 What is best is told stretch by stretch: a run, or a part of one where there are few. On
 each, errors are taken over those of what costs nothing, the ridge regression or a
 constant state, whichever is better *there*; and being behind counts twice. For the rows
@@ -17,7 +22,7 @@ their gains agree. And up to a half of the average is what costs nothing, where 
 costs next to nothing.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -59,6 +64,14 @@ class Rollouts:
     def __getitem__(self, index: Any) -> "Rollouts":
         rows = None if self.rows is None else self.rows[index]
         return Rollouts(self.windows[index], self.predicted[index], rows)
+
+    @classmethod
+    def of_constant_state(
+        cls, windows: Windows, rows: np.ndarray | None = None
+    ) -> "Rollouts":
+        """Returns rollouts of a state that stays where the windows start."""
+        start = windows.states[:, windows.past : windows.past + 1]
+        return cls(windows, np.repeat(start, windows.ahead, axis=1), rows)
 
     def distances(self, steps: Sequence[int]) -> Array:
         """Computes the errors (W, steps, groups) at some steps."""
@@ -103,7 +116,10 @@ class Averages(NamedTuple):
 
 
 def choose_averages(
-    kinematics: Kinematics, rollouts: Rollouts, judged_steps: Sequence[int]
+    kinematics: Kinematics,
+    rollouts: Rollouts,
+    judged_steps: Sequence[int],
+    constant_states: Mapping[int, Rollouts],
 ) -> Averages:
     """Chooses which corrections are averaged, for each judged step and group.
 
@@ -114,8 +130,9 @@ def choose_averages(
         kinematics: Of the model.
         rollouts: Of all that was held out.
         judged_steps: Whose errors decide.
+        constant_states: Rollouts on all windows that reach a judged step, by the step.
     """
-    errors = _errors_on_other_runs(kinematics, rollouts, judged_steps)
+    errors = _errors_on_other_runs(kinematics, rollouts, judged_steps, constant_states)
     stretches = _stretches_of(rollouts.windows)
     columns_by_group = rollouts.windows.space.error_columns
     shares = np.empty((len(_PRIORS), len(judged_steps), len(columns_by_group)))
@@ -131,21 +148,24 @@ def choose_averages(
 
 
 def _errors_on_other_runs(
-    kinematics: Kinematics, rollouts: Rollouts, judged_steps: Sequence[int]
+    kinematics: Kinematics,
+    rollouts: Rollouts,
+    judged_steps: Sequence[int],
+    constant_states: Mapping[int, Rollouts],
 ) -> Array:
     """Computes errors (priors, W, judged steps, e), corrected by what others say."""
     windows = rollouts.windows
     shape = len(_PRIORS), len(windows), len(judged_steps), windows.space.error_dim
     errors = np.empty(shape)
     for is_own in _parts_of_whole_runs(windows):
-        others = rollouts[_are_apart(rollouts, is_own)]
         own = rollouts[is_own]
-        corrections = Correction.fit_each(
+        corrections = _fit_each(
             kinematics=kinematics,
-            windows=others.windows,
-            predicted=others.predicted,
+            rollouts=_apart_from(own, rollouts),
+            constant_states={
+                step: _apart_from(own, constant_states[step]) for step in judged_steps
+            },
             steps=judged_steps,
-            priors=_PRIORS,
         )
         for i, correction in enumerate(corrections):
             corrected = correction(own.windows, own.predicted)
@@ -153,25 +173,63 @@ def _errors_on_other_runs(
     return errors
 
 
-def _are_apart(rollouts: Rollouts, is_own: np.ndarray) -> np.ndarray:
-    """Finds the windows (W,) of others that share no row with those of a part.
+def _fit_each(
+    kinematics: Kinematics,
+    rollouts: Rollouts,
+    constant_states: Mapping[int, Rollouts],
+    steps: Sequence[int],
+) -> list[Correction]:
+    """Fits a correction for each prior.
+
+    Args:
+        kinematics: Of the model.
+        rollouts: Of held-out rows.
+        constant_states: By each step, for the priors that keep nothing of a rollout.
+        steps: At which a regression stands.
+    """
+    with_movement = Correction.fit_each(
+        kinematics=kinematics,
+        windows=rollouts.windows,
+        predicted=rollouts.predicted,
+        steps=steps,
+        priors=[prior for prior in _PRIORS if prior.movement],
+    )
+    without_movement = [
+        Correction.fit_each(
+            kinematics=kinematics,
+            windows=constant_states[step].windows,
+            predicted=constant_states[step].predicted,
+            steps=(step,),
+            priors=[prior for prior in _PRIORS if not prior.movement],
+        )
+        for step in steps
+    ]
+    by_prior = [Correction.of_steps(one) for one in zip(*without_movement, strict=True)]
+    corrections = {True: iter(with_movement), False: iter(by_prior)}
+    return [next(corrections[prior.movement > 0]) for prior in _PRIORS]
+
+
+def _apart_from(own: Rollouts, rollouts: Rollouts) -> Rollouts:
+    """Returns the rollouts that share no row with a part of them.
 
     The past of a block's first windows is the end of the block before: a correction
-    that was fitted there has seen it, and is no test of itself. Where no window is
-    apart, all others are taken.
+    that was fitted there has seen it, and is no test of itself. Where none is apart,
+    all are taken that start elsewhere.
     """
-    if rollouts.rows is None:
-        return ~is_own
-    own_rows = np.sort(rollouts.rows[is_own])
+    windows = rollouts.windows
+    if rollouts.rows is None or own.rows is None:
+        return rollouts[~np.isin(windows.runs, own.windows.runs)]
+    own_rows = np.sort(own.rows)
     following = np.searchsorted(own_rows, rollouts.rows)
     next_row = own_rows[np.minimum(following, len(own_rows) - 1)]
     last_row = own_rows[np.maximum(following - 1, 0)]
     distances = np.minimum(
         np.abs(rollouts.rows - next_row), np.abs(rollouts.rows - last_row)
     )
-    are_near = distances <= rollouts.windows.past + rollouts.windows.ahead
-    are_apart = ~is_own & ~are_near
-    return are_apart if are_apart.any() else ~is_own
+    are_apart = distances > own.windows.past + own.windows.ahead
+    if not are_apart.any():
+        are_apart = distances > 0
+    return rollouts[are_apart]
 
 
 def _choose_shares(errors: Array, regret: "_Regret") -> Array:
@@ -309,10 +367,16 @@ def _mean_length(errors: Array) -> float:
     return float(np.linalg.norm(errors, axis=-1).mean())
 
 
+def correction_steps(last: int) -> list[int]:
+    """Returns the steps at which a correction stands, up to the last one."""
+    return sorted({knot for knot in _KNOTS if knot < last} | {last})
+
+
 def fit_correction(
     kinematics: Kinematics,
     rollouts: Rollouts,
     judged_steps: Sequence[int],
+    constant_states: Mapping[int, Rollouts],
     shares: Array,
 ) -> Correction:
     """Fits a correction of rollouts, at all of its steps.
@@ -321,17 +385,11 @@ def fit_correction(
         kinematics: Of the model.
         rollouts: That are corrected.
         judged_steps: Those of the shares.
+        constant_states: Rollouts on all windows that reach a step, by the step.
         shares: Of the corrections that are averaged (priors, judged steps, groups).
     """
-    last = rollouts.windows.ahead
-    knots = sorted({knot for knot in _KNOTS if knot < last} | {last})
-    corrections = Correction.fit_each(
-        kinematics=kinematics,
-        windows=rollouts.windows,
-        predicted=rollouts.predicted,
-        steps=knots,
-        priors=_PRIORS,
-    )
+    knots = correction_steps(rollouts.windows.ahead)
+    corrections = _fit_each(kinematics, rollouts, constant_states, knots)
     # Each knot has the shares of the nearest judged step.
     judged = np.log(judged_steps)
     nearest = [np.abs(judged - np.log(knot)).argmin() for knot in knots]

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gpmpc.exceptions import DataError
+from gpmpc.logs._baselines import RIDGE_WINDOWS
 from gpmpc.logs._fitting import PAST, NominalFit
 from gpmpc.logs._folds import MANY_RUNS, Fold
 from gpmpc.logs._log import Log
@@ -15,6 +16,7 @@ from gpmpc.logs._rollout_corrections import (
     Averages,
     Rollouts,
     choose_averages,
+    correction_steps,
     fit_correction,
 )
 from gpmpc.logs._structure_fits import StructureFits
@@ -34,6 +36,7 @@ _LARGEST_DEPARTURE = 1e6
 class _Validation(NamedTuple):
     """Held-out rows, and a model without a correction that was fitted to the others."""
 
+    train: Log  # the others
     held_out: Log
     model: LogModel
     rollouts: Rollouts  # of the held-out rows
@@ -92,6 +95,7 @@ class Validations:
             kinematics=structure.model.kinematics,
             rollouts=Rollouts.concatenate(parts),
             judged_steps=self._judged_steps,
+            constant_states=self._constant_states(self._log),
         )
 
     def models(self, structure: Structure) -> list[LogModel]:
@@ -106,8 +110,13 @@ class Validations:
             ]
             # What one fold holds out, the models of the others were fitted to.
             self._models[structure.key] = [
-                self._correct(model, structure, rollouts[:i] + rollouts[i + 1 :])
-                for i, model in enumerate(models)
+                self._correct(
+                    model=model,
+                    structure=structure,
+                    rollouts=rollouts[:i] + rollouts[i + 1 :],
+                    fitted_to=fold.train,
+                )
+                for i, (model, fold) in enumerate(zip(models, self._folds, strict=True))
             ]
         return self._models[structure.key]
 
@@ -117,7 +126,13 @@ class Validations:
         models = []
         for validation in validations:
             others = [one.rollouts for one in validations if one is not validation]
-            models.append(self._correct(validation.model, structure, others))
+            model = self._correct(
+                model=validation.model,
+                structure=structure,
+                rollouts=others,
+                fitted_to=validation.train,
+            )
+            models.append(model)
         held_out = [validation.held_out for validation in validations]
         noise = fit_noise(models, held_out, self._steps)
         has_halves = len(validations) > len(self._folds)
@@ -139,7 +154,13 @@ class Validations:
         """Fits a structure to all runs, its GPs and its correction as well."""
         fit = self._fits.fit_to_all_runs(structure)
         rollouts = [validation.rollouts for validation in self._validate(structure)]
-        return replace(fit, model=self._correct(fit.model, structure, rollouts))
+        model = self._correct(
+            model=fit.model,
+            structure=structure,
+            rollouts=rollouts,
+            fitted_to=self._log,
+        )
+        return replace(fit, model=model)
 
     def _validate(self, structure: Structure) -> list[_Validation]:
         """Fits a structure to parts of the rows, and rolls it out on the others.
@@ -151,7 +172,12 @@ class Validations:
         if structure.key not in self._validations:
             folds, models = self._validation_models(structure)
             self._validations[structure.key] = [
-                _Validation(fold.held_out, model, self._rollouts(model, fold.held_out))
+                _Validation(
+                    train=fold.train,
+                    held_out=fold.held_out,
+                    model=model,
+                    rollouts=self._rollouts(model, fold.held_out),
+                )
                 for fold, model in zip(folds, models, strict=True)
             ]
         return self._validations[structure.key]
@@ -208,6 +234,18 @@ class Validations:
         rows = self._rows_of(windows, held_out)
         return Rollouts(windows, predicted, rows)[stays_near]
 
+    def _constant_states(self, part: Log) -> dict[int, Rollouts]:
+        """Returns rollouts of a constant state on all that a part of the log has.
+
+        For each step of a correction they are as long.
+        """
+        rollouts = {}
+        for step in correction_steps(self._steps):
+            windows = part.windows(step, past=PAST, most=RIDGE_WINDOWS)
+            rows = self._rows_of(windows, part)
+            rollouts[step] = Rollouts.of_constant_state(windows, rows)
+        return rollouts
+
     def _rows_of(self, windows: Windows, part: Log) -> np.ndarray:
         """Returns the rows of the log at which windows of a part of it start (W,).
 
@@ -226,15 +264,27 @@ class Validations:
         return rows
 
     def _correct(
-        self, model: LogModel, structure: Structure, rollouts: Sequence[Rollouts]
+        self,
+        model: LogModel,
+        structure: Structure,
+        rollouts: Sequence[Rollouts],
+        fitted_to: Log,
     ) -> LogModel:
-        """Adds the correction of a structure, fitted to rollouts, if it has one."""
+        """Adds the correction of a structure, if it has one.
+
+        Args:
+            model: Without a correction.
+            structure: Of the model.
+            rollouts: That are corrected.
+            fitted_to: Rows that the model was fitted to.
+        """
         if not structure.shares:
             return model
         correction = fit_correction(
             kinematics=model.kinematics,
             rollouts=Rollouts.concatenate(rollouts),
             judged_steps=self._judged_steps,
+            constant_states=self._constant_states(fitted_to),
             shares=np.array(structure.shares),
         )
         return replace(model, correction=correction)

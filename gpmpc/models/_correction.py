@@ -86,15 +86,47 @@ class Correction:
 
     @staticmethod
     def average(corrections: "Sequence[Correction]", shares: Array) -> "Correction":
-        """Averages corrections that were fitted to the same rollouts.
+        """Averages corrections with the same steps.
 
         Args:
             corrections: A of them.
             shares: Of each, by step and entry of the errors (A, S, e).
         """
-        weights = np.array([one.weights for one in corrections])
+        first = corrections[0]
+        weights = np.array(
+            [one._weights_for(first.mean, first.deviation) for one in corrections]
+        )
         averaged = np.einsum("ase,asre->sre", shares, weights)
-        return replace(corrections[0], weights=averaged)
+        return replace(first, weights=averaged)
+
+    @staticmethod
+    def of_steps(corrections: "Sequence[Correction]") -> "Correction":
+        """Returns the correction that stands at the steps of several, in their order.
+
+        Args:
+            corrections: Each at later steps than the one before.
+        """
+        return Correction(
+            kinematics=corrections[0].kinematics,
+            steps=tuple(step for one in corrections for step in one.steps),
+            mean=np.concatenate([one.mean for one in corrections]),
+            deviation=np.concatenate([one.deviation for one in corrections]),
+            weights=np.concatenate([one.weights for one in corrections]),
+        )
+
+    def _weights_for(self, mean: Array, deviation: Array) -> Array:
+        """Returns the weights (S, 1 + r, e) of regressors standardised otherwise.
+
+        Args:
+            mean: Of the regressors (S, r).
+            deviation: Likewise.
+        """
+        slopes = self.weights[:, 1:] / self.deviation[..., None]
+        weights = np.empty_like(self.weights)
+        weights[:, 1:] = slopes * deviation[..., None]
+        weights[:, 0] = self.weights[:, 0]
+        weights[:, 0] += np.einsum("sr,sre->se", mean - self.mean, slopes)
+        return weights
 
     def __call__(self, windows: Windows, predicted: Array) -> Array:
         """Corrects rollouts (W, K, n).

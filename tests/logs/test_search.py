@@ -10,13 +10,19 @@ import pytest
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import train
 from gpmpc.logs import Log, LogMapping, fit_nominal, judge, learn
+from gpmpc.logs._baselines import baseline_errors
 from gpmpc.logs._comparison import compare
 from gpmpc.logs._control_fitness import _linearize, judge_for_control
 from gpmpc.logs._folds import split_folds
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._noise import learning_gains
 from gpmpc.logs._ranges import ranges_of
-from gpmpc.logs._rollout_corrections import Rollouts, choose_averages
+from gpmpc.logs._rollout_corrections import (
+    _PRIORS,
+    _RIDGE,
+    Rollouts,
+    choose_averages,
+)
 from gpmpc.logs._search import Search
 from gpmpc.logs._smoothing import smooth
 from gpmpc.logs._structures import (
@@ -281,6 +287,12 @@ def test_a_correction_upon_a_still_state_is_a_regression():
     averaged = Correction.average([correction, free], shares)(windows, still)
     quarter = 0.25 * corrected + 0.75 * still
     np.testing.assert_allclose(averaged, quarter, rtol=0, atol=1e-12)
+    (of_few,) = Correction.fit_each(
+        kinematics, windows[:100], still[:100], (1, 10), [Prior(1e-6)]
+    )
+    averaged = Correction.average([of_few, correction], shares)(windows, still)
+    quarter = 0.25 * of_few(windows, still) + 0.75 * corrected
+    np.testing.assert_allclose(averaged, quarter, rtol=0, atol=1e-9)
     between = correction(windows, still)[:, 4] - still[:, 4]  # 5 of 1 to 10 steps
     ends = correction(windows, still) - still
     expected = ends[:, 0] + (ends[:, 9] - ends[:, 0]) * 4 / 9
@@ -336,12 +348,18 @@ def test_averages_take_what_is_best_on_other_runs():
         [np.zeros((100, 1))] * 6,
     )
     windows = log.windows(10, past=20)
+    still = Rollouts.of_constant_state(windows)
     measured = windows.states[:, 21:]
     errors = np.random.default_rng(9).normal(size=measured.shape)
 
-    def ratios(rollouts):
-        kinematics = Increments(log.space)
-        return choose_averages(kinematics, Rollouts(windows, rollouts), (1, 10)).ratios
+    def ratios(predicted):
+        averages = choose_averages(
+            kinematics=Increments(log.space),
+            rollouts=Rollouts(windows, predicted),
+            judged_steps=(1, 10),
+            constant_states=dict.fromkeys((1, 10), still),
+        )
+        return averages.ratios
 
     # What is exact stays; of what only errs, less than the rest is kept.
     np.testing.assert_allclose(ratios(measured), 1.0)
@@ -355,11 +373,16 @@ def test_what_runs_have_each_for_themselves_is_not_corrected():
     states = [level + 10 * rng.normal(size=(100, 2)) for level in levels]
     log = log_of(states, [np.full((100, 1), level) for level in rng.normal(size=6)])
     windows = log.windows(10, past=20)
+    still = Rollouts.of_constant_state(windows)
     measured = windows.states[:, 21:]
 
     def averages(errors):
-        rollouts = Rollouts(windows, measured + errors)
-        return choose_averages(Increments(log.space), rollouts, (1, 10))
+        return choose_averages(
+            kinematics=Increments(log.space),
+            rollouts=Rollouts(windows, measured + errors),
+            judged_steps=(1, 10),
+            constant_states=dict.fromkeys((1, 10), still),
+        )
 
     own = averages(rng.normal(size=(6, 1, 2))[windows.runs])
     assert (own.ratios > 0.8).all()
@@ -589,6 +612,29 @@ def test_states_of_any_unit_are_corrected(scale):
     search = tiny_search(replace(log, runs=runs))
     start = next(one for one in search._structures.values() if one.size == 0)
     assert search._validations.choose_averages(start) is not None
+
+
+def test_a_correction_that_is_the_ridge_regression_alone_is_the_baseline():
+    """It is fitted to all windows, and not to those of held-out blocks alone."""
+    log = reactor_log(240)
+    search = tiny_search(log)
+    start = next(one for one in search._structures.values() if one.size == 0)
+    shares = np.zeros((len(_PRIORS), 2, 2))
+    shares[_RIDGE] = 1.0
+    ridge = replace(start, shares=tuple(tuple(map(tuple, one)) for one in shares))
+
+    def check(model, fitted_to):
+        for step in search.judged_steps:
+            windows = log.windows(step, past=20)
+            errors = model.rollout_errors(windows, [step])
+            baselines = baseline_errors(model.kinematics, fitted_to, windows, [step])
+            expected = baselines["ridge regression"]
+            np.testing.assert_allclose(errors, expected, rtol=0, atol=1e-9)
+
+    check(search._validations.fit_to_all_runs(ridge).model, log)
+    models = search._validations.models(ridge)
+    for model, fold in zip(models, search._folds, strict=True):
+        check(model, fold.train)
 
 
 def test_without_inputs_nothing_acts_through_lags():
