@@ -218,7 +218,8 @@ class Decision:
     #: that keeps its bounds. It comes from steps towards the optimum, so it is better
     #: than the guess (Scokaert, Mayne and Rawlings, 1999). Or whether the program keeps
     #: a hard bound and its plan, rolled out by the model, does not
-    #: (``HARD_BOUND_MISSED``)
+    #: (``HARD_BOUND_MISSED``). Or whether ``ManyStarts`` goes on along a plan at a step
+    #: whose own solve failed as the status says
     suboptimal: bool = False
     #: predicted cost of each stage of the plan (H,), that of x_{k+1} and u_k; empty
     #: where it is not known

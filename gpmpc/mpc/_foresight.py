@@ -21,8 +21,9 @@ from gpmpc.models import RollOut
 from gpmpc.mpc._controller import Decision, Timing
 from gpmpc.mpc._question import Question, first_weight, hold_last
 from gpmpc.mpc._riccati import finite_horizon_lqr
-from gpmpc.mpc._stage_meter import StageMeter
+from gpmpc.mpc._stage_meter import CostSum, FlownCosts, StageMeter
 from gpmpc.mpc.gp_mpc import GPMPC
+from gpmpc.mpc.problem import Problem
 from gpmpc.status import Status
 
 Array = np.ndarray
@@ -32,6 +33,7 @@ _STAGES = 200  # or so many stages, where these are more
 _HOLDING_PART = 6  # the goal counts as held after this part of a horizon near it,
 _FEWEST = 3  # but not after fewer stages
 _NEAR_GOAL = 0.01  # share of the dearest stage's cost that a stage near the goal has
+_SMALL_PART = 1e-4  # of the range of an input, whose cost is none beside others
 _STANDSTILL = 0.01  # share by which costs differ where the plant stands still
 _ROUNDS = 5  # in which a flight is improved, the turns of its goal read anew
 _PROGRAMS = 10  # of a round
@@ -49,7 +51,7 @@ class ModelFlight:
 
     states: Array  #: x_0 .. x_L (L + 1, n)
     inputs: Array  #: (L, m)
-    costs: Array  #: of x_{k+1} and u_k (L,)
+    costs: FlownCosts  #: of x_{k+1} and u_k, L stages
     arrives: bool  #: whether it ends where the goal is held
     gains: Array | None = None  #: K of the feedback u_k - K_k (x - x_k) (L, m, n)
     plan: Decision | None = None  #: the controller's last, a stage before the end
@@ -59,8 +61,13 @@ class ModelFlight:
 
     @property
     def cost(self) -> float:
-        """Cost of all stages."""
-        return float(self.costs.sum())
+        """Cost of all stages; infinite where one is beyond a hard bound."""
+        return float(self.costs.total.sum())
+
+    @property
+    def cost_sum(self) -> CostSum:
+        """The same in parts, without the stages beyond a hard bound."""
+        return self.costs.sum()
 
     def is_better_than(self, other: "ModelFlight") -> bool:
         """Tells whether it alone arrives, or costs less.
@@ -75,7 +82,7 @@ class ModelFlight:
         return self._cost_over(length) < other._cost_over(length)
 
     def _cost_over(self, length: int) -> float:
-        return self.cost + float(self.costs[-1]) * (length - len(self))
+        return self.cost + float(self.costs.total[-1]) * (length - len(self))
 
     def after(self, stages: int) -> "ModelFlight":
         """Returns what is left of it after some stages."""
@@ -107,6 +114,7 @@ class Foresight:
         self._model = controller.prediction.model
         self._roll_out = RollOut(self._model)
         self._holding_stages = max(_FEWEST, controller.horizon // _HOLDING_PART)
+        self._negligible = _negligible_cost(controller.prediction.problem)
         horizons = (controller.horizon // 2, controller.horizon // 4)
         shorter = [
             self._with_horizon(horizon, controller.iterations, controller.tolerance)
@@ -142,19 +150,28 @@ class Foresight:
         except SettingError:
             return None
 
-    def arrives(self, costs: Array, dearest: float = 0.0) -> bool:
-        """Tells whether the goal is held at the end of stages with costs (L,).
+    def arrives(self, costs: FlownCosts, dearest: float = 0.0) -> bool:
+        """Tells whether the goal is held at the end of stages with costs.
 
-        ``dearest`` is the cost of a stage before, where one is known. Stages beyond a
-        hard bound, whose costs are infinite, say nothing of how dear a stage is.
+        Near it, stages weigh little beside the dearest one; or the plant stands still,
+        and the inputs that hold it there are all that it costs. What violations of soft
+        constraints cost says nothing of how near the goal is, and stages beyond a hard
+        bound nothing at all.
+
+        Args:
+            costs: Of the stages.
+            dearest: What a stage before weighed, where one is known.
         """
         if len(costs) < self._holding_stages:
             return False
         last = costs[-self._holding_stages :]
-        if not np.isfinite(last).all():
+        if not last.are_finite.all():
             return False
-        limit = _NEAR_GOAL * max(dearest, float(finite_costs(costs).max()))
-        return bool((last <= limit).all())
+        limit = _NEAR_GOAL * max(dearest, costs.dearest)
+        if (last.weighed <= max(limit, self._negligible)).all():
+            return True
+        is_there = (last.errors <= _NEAR_GOAL * last.weighed).all()
+        return bool(is_there) and _stand(last.weighed)
 
     def fly(
         self, beginning: Trajectory, question: Question, limit: float = np.inf
@@ -168,7 +185,7 @@ class Foresight:
             None where it costs more than ``limit``, or the controller fails.
         """
         costs = self.meter(beginning.states, beginning.inputs, question)
-        if not np.isfinite(costs).all():
+        if not costs.are_finite.all():
             return None
         growing = _GrowingFlight(self, beginning, costs, question)
         while growing.paid <= limit:
@@ -195,13 +212,13 @@ class Foresight:
                 return flight
         return growing.flight()
 
-    def _stands(self, costs: Array) -> bool:
+    def _stands(self, costs: FlownCosts) -> bool:
         """Tells whether the last stages cost the same.
 
         They are as many as the goal is to be held for.
         """
         last = costs[-self._holding_stages :]
-        return bool(np.ptp(last) <= _STANDSTILL * last.max())
+        return _stand(last.weighed) and _stand(last.violations)
 
     def step(self, state: Array, input: Array, question: Question) -> Array:
         """Returns the next state (n,) of the model."""
@@ -229,7 +246,7 @@ class Foresight:
             states, inputs = self.roll_out(centre, inputs, gains, state, question)
             if not np.isfinite(states).all():
                 continue
-            for last in _swings(self.meter(states, inputs, question)):
+            for last in _swings(self.meter(states, inputs, question).weighed):
                 yield states[: last + 2], inputs[: last + 1]
 
     def follow(
@@ -247,7 +264,7 @@ class Foresight:
         states, inputs = self.roll_out(
             flight.states, flight.inputs, flight.gains, state, question
         )
-        costs = np.full(len(inputs), np.inf)
+        costs = FlownCosts.unknown(len(inputs))
         arrives = False
         if np.isfinite(states).all():
             costs = self.meter(states, inputs, question)
@@ -364,20 +381,17 @@ class Foresight:
             )
             if not plan.applicable:
                 break
-            no_gains = np.zeros((length, *np.shape(plan.inputs)[1:], len(state)))
             planned = ModelFlight(
-                states=plan.means,
-                inputs=plan.inputs,
-                costs=flight.costs,
-                arrives=True,
-                gains=no_gains,
+                states=plan.means, inputs=plan.inputs, costs=flight.costs, arrives=True
             )
+            # A plan may have defects, which inputs alone would multiply.
+            planned = self.with_gains(planned, question)
             candidate = self.follow(planned, state, question)
             if not (candidate.arrives and candidate.cost < flight.cost):
                 break
             saving = flight.cost - candidate.cost
             flight = replace(candidate, gains=None, plan=flight.plan)
-            if saving <= _GAIN * flight.cost:
+            if saving <= _GAIN * flight.cost_sum.weighed:
                 break
         return flight
 
@@ -389,7 +403,7 @@ class _GrowingFlight:
         self,
         foresight: Foresight,
         beginning: Trajectory,
-        costs: Array,
+        costs: FlownCosts,
         question: Question,
     ):
         self._foresight = foresight
@@ -398,8 +412,8 @@ class _GrowingFlight:
         self._question_over_horizon = question.over(beginning.controller.horizon)
         self._states = list(beginning.states)
         self._inputs = list(beginning.inputs)
-        self._costs = list(costs)
-        self.paid = float(costs.sum())
+        self._costs = [costs]
+        self.paid = float(costs.total.sum())
         self._plan = beginning.previous
         if self._plan is None:
             n = beginning.states.shape[1]
@@ -432,19 +446,19 @@ class _GrowingFlight:
         costs = self._foresight.meter(
             np.array([state, next_state]), plan.input[None], question
         )
-        cost = float(costs[0])
+        cost = float(costs.total[0])
         if not np.isfinite(cost):
             return False
         self._states.append(next_state)
         self._inputs.append(plan.input)
-        self._costs.append(cost)
+        self._costs.append(costs)
         self.paid += cost
         self._plan = plan
         return True
 
     def flight(self) -> ModelFlight:
         """Returns what was flown so far."""
-        costs = np.array(self._costs)
+        costs = FlownCosts.joined(self._costs)
         return ModelFlight(
             states=np.array(self._states),
             inputs=np.array(self._inputs),
@@ -454,9 +468,21 @@ class _GrowingFlight:
         )
 
 
-def finite_costs(costs: Array) -> Array:
-    """Returns those of costs that are finite."""
-    return costs[np.isfinite(costs)]
+def _stand(costs: Array) -> bool:
+    """Tells whether stages (K,) cost the same."""
+    return bool(np.ptp(costs) <= _STANDSTILL * costs.max())
+
+
+def _negligible_cost(problem: Problem) -> float:
+    """Returns what a small part of the inputs' ranges costs: a stage as good as free.
+
+    Zero where an input is not bounded.
+    """
+    lower, upper = (side[0] for side in problem.inputs.sides)
+    if not np.isfinite(upper - lower).all():
+        return 0.0
+    small = _SMALL_PART * (upper - lower)
+    return float(small @ first_weight(problem.cost.R) @ small)
 
 
 def _swings(costs: Array) -> list[int]:

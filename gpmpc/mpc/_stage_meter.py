@@ -3,23 +3,135 @@
 The stage costs of a decision (``Decision.stage_costs``) are those of its program: with
 the weights of H stages, the terminal one at the end, and spreads. What is flown on has
 more stages than that and no end, so each is weighed here as the first one of a program.
+
+What is weighed and what is violated stand apart: beside an exact price of 1e6 weights
+nothing else would be seen, where shares of a cost are compared.
 """
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from gpmpc.mpc._constraints import ConstraintRows
-from gpmpc.mpc._controller import FEASIBLE
+from gpmpc.mpc._controller import FEASIBLE, KEPT
 from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._linear_quadratic import Plan
 from gpmpc.mpc._question import Question, first_weight, hold_last, rows_over
 from gpmpc.mpc.problem import Problem
 
 Array = np.ndarray
+
+
+class CostSum(NamedTuple):
+    """What many stages cost together."""
+
+    weighed: float  # errors, outputs and inputs
+    violations: float  # of soft constraints
+    beyond: int  # stages beyond a hard bound, which have no price
+
+    @property
+    def total(self) -> float:
+        """All that has a price."""
+        return self.weighed + self.violations
+
+    def less(self, other: "CostSum") -> "CostSum":
+        """Returns what is left after other stages were paid."""
+        return CostSum(
+            weighed=self.weighed - other.weighed,
+            violations=self.violations - other.violations,
+            beyond=self.beyond - other.beyond,
+        )
+
+    def largest(self, other: "CostSum") -> "CostSum":
+        """Returns the larger one of each part."""
+        return CostSum(
+            weighed=max(self.weighed, other.weighed),
+            violations=max(self.violations, other.violations),
+            beyond=max(self.beyond, other.beyond),
+        )
+
+    def is_dearer(self, expected: "CostSum", share: float, whole: "CostSum") -> bool:
+        """Tells whether it is above what was expected, by more than a share of a whole.
+
+        What is weighed counts against what is weighed of the whole, and violations
+        against violations: neither is lost beside the other.
+        """
+        if self.beyond > expected.beyond:
+            return True
+        if not self.total - expected.total > share * whole.weighed:
+            return False
+        weighed_rises = self.weighed - expected.weighed > share * whole.weighed
+        violation_rise = self.violations - expected.violations
+        return weighed_rises or violation_rise > share * whole.violations
+
+
+@dataclass(frozen=True)
+class FlownCosts:
+    """What each stage of a trajectory costs, in parts."""
+
+    errors: Array  #: of states and outputs (L,)
+    inputs: Array  #: (L,)
+    violations: Array  #: of constraints (L,); infinite beyond a hard bound
+
+    def __len__(self) -> int:
+        return len(self.errors)
+
+    def __getitem__(self, stages: slice) -> "FlownCosts":
+        return FlownCosts(
+            errors=self.errors[stages],
+            inputs=self.inputs[stages],
+            violations=self.violations[stages],
+        )
+
+    @classmethod
+    def joined(cls, parts: "list[FlownCosts]") -> "FlownCosts":
+        """Returns those of trajectories one behind the other."""
+        return cls(
+            errors=np.concatenate([part.errors for part in parts]),
+            inputs=np.concatenate([part.inputs for part in parts]),
+            violations=np.concatenate([part.violations for part in parts]),
+        )
+
+    @classmethod
+    def unknown(cls, count: int) -> "FlownCosts":
+        """Returns those of stages that cannot be flown."""
+        return cls(
+            errors=np.zeros(count),
+            inputs=np.zeros(count),
+            violations=np.full(count, np.inf),
+        )
+
+    @property
+    def weighed(self) -> Array:
+        """Of each stage without its violations (L,)."""
+        return self.errors + self.inputs
+
+    @property
+    def total(self) -> Array:
+        """Of each stage (L,)."""
+        return self.weighed + self.violations
+
+    @property
+    def are_finite(self) -> Array:
+        """Which stages have a price (L,): those that keep hard bounds."""
+        return np.isfinite(self.total)
+
+    @property
+    def dearest(self) -> float:
+        """What the dearest stage weighs of those that keep hard bounds; 0 without."""
+        return float(self.weighed[self.are_finite].max(initial=0.0))
+
+    def sum(self) -> CostSum:
+        """Returns what all stages cost."""
+        finite = self.are_finite
+        return CostSum(
+            weighed=float(self.weighed[finite].sum()),
+            violations=float(self.violations[finite].sum()),
+            beyond=int((~finite).sum()),
+        )
 
 
 class _Horizon(NamedTuple):
@@ -32,7 +144,7 @@ class _Horizon(NamedTuple):
 
 
 class StageMeter:
-    """Costs of stages as they are paid, outputs and violated constraints included.
+    """Measures what stages cost, outputs and violated constraints included.
 
     Weights are those of the first stage, wherever a stage stands, of outputs as well:
     what is weighed at the end alone is left out. Angles count within half a turn.
@@ -49,46 +161,53 @@ class StageMeter:
         self._rows = ConstraintRows(problem, horizon, "none")
         self._always = self._rows.applies.all(axis=0)
 
-    def __call__(self, states: Array, inputs: Array, question: Question) -> Array:
-        """Returns the costs (L,) of states (L + 1, n) and inputs (L, m).
+    def __call__(self, states: Array, inputs: Array, question: Question) -> FlownCosts:
+        """Returns the costs of states (L + 1, n) and inputs (L, m).
 
-        They are infinite beyond a hard bound. The reference is that of the question;
-        beyond its end it stands still.
+        The reference is that of the question; beyond its end it stands still.
         """
         count = len(inputs)
         reference = question.reference
         reference_inputs = None
         if reference.inputs is not None:
             reference_inputs = hold_last(np.asarray(reference.inputs), count)
-        costs = self._problem.cost.paid(
+        paid = self._problem.cost.paid_parts(
             states=states,
             inputs=inputs,
             references=hold_last(np.asarray(reference.states), count + 1),
             previous_input=question.previous_input,
             reference_inputs=reference_inputs,
         )
-        costs += self.functions(states, inputs, question.parameters)
-        return costs
+        outputs, violations = self.functions(states, inputs, question.parameters)
+        return FlownCosts(
+            errors=paid.states + outputs, inputs=paid.inputs, violations=violations
+        )
 
-    def functions(self, states: Array, inputs: Array, parameters: Any) -> Array:
-        """Returns the costs of outputs and of violated constraints (L,).
+    def functions(
+        self, states: Array, inputs: Array, parameters: Any
+    ) -> tuple[Array, Array]:
+        """Returns the costs of outputs (L,) and of violated constraints (L,).
 
         They are evaluated for a horizon at a time; see ``__call__``. Where a function
-        or its slope is not finite, a horizon's costs are infinite.
+        or its slope is not finite, a horizon's violations are infinite.
         """
         count = len(inputs)
-        costs = np.zeros(count)
+        outputs = np.zeros(count)
+        violations = np.zeros(count)
         if not (self._outputs or self._rows.per_stage):
-            return costs
+            return outputs, violations
         for stages in self._horizons(states, inputs, parameters):
             first = stages.first
             end = min(first + self._horizon, count)
             try:
-                chunk = self._output_costs(stages) + self._violations(stages)
+                output_costs = self._output_costs(stages)
+                violation_costs = self._violations(stages)
             except FunctionNotFinite:
-                chunk = np.full(self._horizon, np.inf)
-            costs[first:end] = chunk[: end - first]
-        return costs
+                output_costs = np.zeros(self._horizon)
+                violation_costs = np.full(self._horizon, np.inf)
+            outputs[first:end] = output_costs[: end - first]
+            violations[first:end] = violation_costs[: end - first]
+        return outputs, violations
 
     def output_weights(self, states: Array, inputs: Array, parameters: Any) -> Array:
         """Returns the weights Z (L, n + m + 1, n + m + 1) of [x_{k+1}; u_k; 1].
@@ -143,7 +262,11 @@ class StageMeter:
         return np.einsum("ki,kij,kj->k", points, self._squares(stages), points)
 
     def _violations(self, stages: _Horizon) -> Array:
-        """Returns the prices of violated constraints (H,), infinite of hard ones."""
+        """Returns the prices of violated constraints (H,), infinite of hard ones.
+
+        Soft ones count from where they are no longer kept: at an exact price, rounding
+        would cost more than the rest of a plan.
+        """
         if not self._rows.per_stage:
             return np.zeros(self._horizon)
         states = stages.next_states
@@ -160,6 +283,6 @@ class StageMeter:
         excess = excess[:, self._always]
         prices = self._rows.prices[self._always]
         hard = np.isinf(prices)
-        costs = excess[:, ~hard] @ prices[~hard]
+        costs = (excess[:, ~hard] - KEPT).clip(0.0) @ prices[~hard]
         costs[(excess[:, hard] > FEASIBLE).any(axis=1)] = np.inf
         return costs

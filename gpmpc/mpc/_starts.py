@@ -6,6 +6,14 @@ itself would do, programs from every pair of a goal and a guess, and what relays
 that push with all the inputs have, in the rhythm of the plant. Each is flown on in the
 model until the goal is held (``_foresight``). The flight that costs least is improved
 as a whole, and followed under its feedback.
+
+    start         a goal and a guess of a plan                      (``_start_guesses``)
+    beginning     states and inputs from which a controller steers on (``Trajectory``)
+    flight        a beginning, flown on until the goal is held      (``ModelFlight``)
+    pursuit       the flight that is followed: what it was expected to cost, and what
+                  is left of that                                   (``_Pursuit``)
+    question      what a controller is asked at any state           (``Question``)
+    situation     the arguments of a decision                       (``_Situation``)
 """
 
 import math
@@ -31,25 +39,24 @@ from gpmpc.mpc._controller import (
     Reference,
     check_arguments,
 )
-from gpmpc.mpc._foresight import Foresight, ModelFlight, Trajectory, finite_costs
+from gpmpc.mpc._foresight import Foresight, ModelFlight, Trajectory
 from gpmpc.mpc._linear_quadratic import References, evaluate_cost
 from gpmpc.mpc._linearization import StageCosts, StageLinearizer
 from gpmpc.mpc._question import Question
+from gpmpc.mpc._stage_meter import CostSum, FlownCosts
 from gpmpc.mpc._start_guesses import Starts, kicks, turned
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.propagation import Linearization
-from gpmpc.status import Status
 
 Criterion = Callable[[Decision, Reference], float]
 
-_RISE = 0.1  # share of what a search promised by which a flight may become dearer
+_RISE = 0.1  # share of what a flight was to cost by which it may become dearer
 _DRIFT = 0.01  # the same share, above which what is left of a flight is improved
 _CORRECTIONS = 2  # programs that improve it, a decision
-_ROOM = (
-    1.3  # times the cheapest flight's cost, up to which a flight is flown to its end
-)
+_ROOM = 0.3  # share of the cheapest flight's cost that one flown to its end is dearer
 _FLIGHTS_IMPROVED = 3  # of a search, the cheapest ones
-_ALIKE = 0.05  # share of the range of a plan's inputs by which the same plan may differ
+_ALIKE = 0.05  # share of the range of an input by which the same plan may differ
+_STILL = 1e-3  # share of its bounds within which an input is as good as constant
 _DEARER = 1e-3  # share of its cost by which a new plan may be dearer than the last one
 
 
@@ -73,32 +80,27 @@ class _Situation(NamedTuple):
 
 
 class _Pursuit(NamedTuple):
-    """What a decision on the way to a set point leaves for the next one.
-
-    What is compared later leaves out stages beyond a hard bound, whose costs are
-    infinite.
-    """
+    """What a decision on the way to a set point leaves for the next one."""
 
     goal: Array  # the set point (n,)
-    promised: float  # cost of the whole flight when it was found, or of one before
-    remaining: float  # what is still to be paid of it
-    dearest: float  # of the stages so far
+    expected: CostSum  # of the whole flight when it was found, or of one before
+    remaining: CostSum  # what is still to be paid of it
+    dearest: float  # of the stages so far, violations left out
     age: int  # decisions since it was found
-    costs: Array  # of the stages of the plan (H,)
+    costs: FlownCosts  # of the stages of the plan
     flight: (
         ModelFlight | None
     )  # from this decision on; None where the controller took over
     arrives: bool = True  # whether it holds the goal in the end
 
     @classmethod
-    def of_plan(cls, goal: Array, costs: Array) -> "_Pursuit":
+    def of_plan(cls, goal: Array, costs: FlownCosts) -> "_Pursuit":
         """Returns that of the controller's own plan to a set point."""
-        cost = float(finite_costs(costs).sum())
         return cls(
             goal=goal,
-            promised=cost,
-            remaining=cost,
-            dearest=float(finite_costs(costs).max(initial=0.0)),
+            expected=costs.sum(),
+            remaining=costs.sum(),
+            dearest=costs.dearest,
             age=0,
             costs=costs,
             flight=None,
@@ -110,17 +112,17 @@ class _Pursuit(NamedTuple):
     ) -> "_Pursuit":
         """Returns that of a flight that was found.
 
-        What a flight to the same goal promised and cost before still counts.
+        What a flight to the same goal was to cost before still counts.
         """
-        promised = float(finite_costs(flight.costs).sum())
-        dearest = float(finite_costs(flight.costs).max(initial=0.0))
+        expected = flight.cost_sum
+        dearest = flight.costs.dearest
         if last is not None:
-            promised = max(promised, last.promised)
+            expected = expected.largest(last.expected)
             dearest = max(dearest, last.dearest)
         return cls(
             goal=goal,
-            promised=promised,
-            remaining=flight.cost,
+            expected=expected,
+            remaining=flight.cost_sum,
             dearest=dearest,
             age=0,
             costs=flight.costs[:horizon],
@@ -128,13 +130,13 @@ class _Pursuit(NamedTuple):
             arrives=flight.arrives,
         )
 
-    def after_decision(self, costs: Array) -> "_Pursuit":
+    def after_decision(self, costs: FlownCosts) -> "_Pursuit":
         """Returns it after one more decision of the controller, with its plan's costs.
 
-        Costs are those of the stages (H,).
+        What remains of a flight is of no use then: its plans are compared.
         """
         return self._replace(
-            dearest=max(self.dearest, float(finite_costs(costs).max(initial=0.0))),
+            dearest=max(self.dearest, costs.dearest),
             age=self.age + 1,
             costs=costs,
             flight=None,
@@ -143,11 +145,16 @@ class _Pursuit(NamedTuple):
     def after_flown_stage(self, flight: ModelFlight, horizon: int) -> "_Pursuit":
         """Returns it after one more decision along a flight, from that decision on."""
         return self._replace(
-            remaining=self.remaining - float(self.costs[0]),
+            remaining=self.remaining_after_stage,
             age=self.age + 1,
             costs=flight.costs[:horizon],
             flight=flight,
         )
+
+    @property
+    def remaining_after_stage(self) -> CostSum:
+        """What is still to be paid once the first stage of the plan was flown."""
+        return self.remaining.less(self.costs[:1].sum())
 
     def after_failed_steps(self, decision: Decision, horizon: int) -> "_Pursuit":
         """Returns it with its flight from a decision's step on.
@@ -157,8 +164,9 @@ class _Pursuit(NamedTuple):
         """
         if self.flight is None:
             return self
-        expected = (self.flight.states == decision.means[0]).all(axis=1)
-        stages = np.flatnonzero(expected)
+        # Means of a plan along a flight are a slice of its states: equal to the digit.
+        is_now = (self.flight.states == decision.means[0]).all(axis=1)
+        stages = np.flatnonzero(is_now)
         if not len(stages):
             return self._replace(flight=None)
         passed_count = int(stages[0])
@@ -167,7 +175,7 @@ class _Pursuit(NamedTuple):
         if passed_count > 0:
             costs = flight.costs[:horizon]
         return self._replace(
-            remaining=self.remaining - float(self.flight.costs[:passed_count].sum()),
+            remaining=self.remaining.less(self.flight.costs[:passed_count].sum()),
             costs=costs,
             flight=flight if len(flight) > horizon else None,
         )
@@ -202,7 +210,7 @@ class _FlightSearch:
         self._question = question
         self._deadline = deadline
         self._flights: list[ModelFlight] = []
-        self._lowest = inf  # cost of a flight that arrives
+        self._cheapest: ModelFlight | None = None  # of those that arrive
         self.best_controller = controller  # whose flight that is
 
     @property
@@ -216,13 +224,18 @@ class _FlightSearch:
 
     def fly(self, beginning: Trajectory) -> None:
         """Adds the flight from a beginning, unless it costs much more than another."""
-        limit = _ROOM * self._lowest
+        limit = inf
+        if self._cheapest is not None:
+            room = _ROOM * self._cheapest.cost_sum.weighed
+            limit = self._cheapest.cost + room
         flight = self._foresight.fly(beginning, self._question, limit)
         if flight is None:
             return
         self._flights.append(flight)
-        if flight.arrives and flight.cost < self._lowest:
-            self._lowest = flight.cost
+        if not flight.arrives:
+            return
+        if self._cheapest is None or flight.cost < self._cheapest.cost:
+            self._cheapest = flight
             self.best_controller = beginning.controller
 
     def best(self) -> ModelFlight | None:
@@ -376,7 +389,8 @@ class ManyStarts:
                 parameters,
                 plan=(start.inputs, start.states),
             )
-            yield decision, self._judge(decision, start.goal)
+            value = self._judge(decision, start.goal, previous, parameters)
+            yield decision, value
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -406,12 +420,15 @@ class ManyStarts:
         deadline = self._deadline()
         last = _without_solution(previous)
         best = self.controller.control(belief, reference, last, parameters)
-        lowest = self._judge(best, self._nearest_turn(reference, best.means[-1]))
+        goal = self._nearest_turn(reference, best.means[-1])
+        lowest = self._judge(best, goal, last, parameters)
         for decision, value in self.plans(belief, reference, last, parameters):
-            if value < lowest:
+            # Among plans beyond a hard bound, whose cost is infinite, the first one.
+            is_first = decision.applicable and not best.applicable
+            if is_first or value < lowest:
                 best = decision
                 lowest = value
-            if lowest < inf and perf_counter() > deadline:
+            if best.applicable and perf_counter() > deadline:
                 break
         return best
 
@@ -429,7 +446,7 @@ class ManyStarts:
                 pursuit.flight, pursuit, situation, question
             )
             pursuit = pursuit.after_flown_stage(current, self.horizon)
-            if self._is_as_promised(current, pursuit):
+            if self._is_as_expected(current, pursuit):
                 return self._decide_along(current, pursuit, situation, question)
         else:
             decision = self._continue_plan(situation, question, pursuit)
@@ -494,33 +511,31 @@ class ManyStarts:
         remaining = foresight.follow(
             flight.after(1), situation.state, question, pursuit.dearest
         )
-        promised = pursuit.remaining - float(pursuit.costs[0])
-        limit = promised + _DRIFT * pursuit.promised
-        if remaining.arrives and remaining.cost > limit:
+        is_dearer = remaining.cost_sum.is_dearer(
+            pursuit.remaining_after_stage, _DRIFT, pursuit.expected
+        )
+        if remaining.arrives and is_dearer:
             remaining = foresight.improve(
                 remaining, question, rounds=1, programs=_CORRECTIONS
             )
             remaining = foresight.with_gains(remaining, question)
         return remaining
 
-    def _is_as_promised(self, flight: ModelFlight, pursuit: _Pursuit) -> bool:
+    def _is_as_expected(self, flight: ModelFlight, pursuit: _Pursuit) -> bool:
         """Tells whether a flight costs what it was to, and arrives if it was to."""
-        limit = pursuit.remaining + _RISE * pursuit.promised
-        return flight.cost <= limit and (flight.arrives or not pursuit.arrives)
+        if flight.cost_sum.is_dearer(pursuit.remaining, _RISE, pursuit.expected):
+            return False
+        return flight.arrives or not pursuit.arrives
 
     def _question(self, situation: _Situation) -> Question:
         """Returns what the controller is asked on the way, beside its last plan."""
         previous = situation.previous
-        previous_input = self.initial_input
-        disturbance = None
-        if previous is not None:
-            previous_input = np.asarray(previous.input, dtype=float)
-            disturbance = previous.disturbance
+        disturbance = None if previous is None else previous.disturbance
         return Question(
             covariance=situation.belief.covariance,
             reference=situation.reference,
             parameters=situation.parameters,
-            previous_input=previous_input,
+            previous_input=self._input_before(previous),
             disturbance=disturbance,
         )
 
@@ -533,14 +548,16 @@ class ManyStarts:
             return None
         return previous.pursuit.after_failed_steps(previous, self.horizon)
 
-    def _is_lost(self, costs: Array, pursuit: _Pursuit | None) -> bool:
-        """Tells whether a plan of stages with costs (H,) is to be searched anew."""
+    def _is_lost(self, costs: FlownCosts, pursuit: _Pursuit | None) -> bool:
+        """Tells whether a plan with the costs of its stages is to be searched anew."""
         if pursuit is None:
             return not self._foresight.arrives(costs)
         if self._foresight.arrives(costs, pursuit.dearest):
             return False
-        rise = costs[:-1].sum() - finite_costs(pursuit.costs[1:]).sum()
-        is_dearer = rise > _RISE * pursuit.promised
+        # Both are of the stages that the last plan saw, too.
+        is_dearer = (
+            costs[:-1].sum().is_dearer(pursuit.costs[1:].sum(), _RISE, pursuit.expected)
+        )
         return is_dearer or pursuit.age >= self._foresight.longest
 
     def _decide_along(
@@ -560,7 +577,9 @@ class ManyStarts:
             question.parameters,
             plan=(inputs, means),
         )
-        return _FollowedDecision.of(self._with_plan(decision, inputs, means), pursuit)
+        return _FollowedDecision.of(
+            self._with_plan(decision, inputs, means, situation.previous), pursuit
+        )
 
     def _search_flight(
         self, situation: _Situation, question: Question, current: ModelFlight | None
@@ -573,7 +592,7 @@ class ManyStarts:
         search = _FlightSearch(
             self._foresight, question, self.controller, self._deadline()
         )
-        if current is not None and np.isfinite(current.cost):
+        if current is not None and current.costs.are_finite.all():
             search.add(current)
         for beginning in self._controller_beginnings(situation):
             search.fly(beginning)
@@ -609,12 +628,14 @@ class ManyStarts:
         state = situation.state
         last = _without_solution(situation.previous)
         different: list[Array] = []
-        for decision, value in self.plans(
+        for decision, _ in self.plans(
             situation.belief, question.reference, last, question.parameters
         ):
             inputs = decision.inputs
             states = decision.means
-            if value == inf or any(_are_alike(inputs, other) for other in different):
+            if not decision.applicable:
+                continue
+            if any(self._are_alike(inputs, other) for other in different):
                 continue
             different.append(inputs)
             if not self.planner.prediction.settings.rolled_out:
@@ -641,29 +662,50 @@ class ManyStarts:
             situation.parameters,
             plan=(inputs, means),
         )
-        question = self._question(situation._replace(reference=goal))
+
+        def plan_cost(means: Array, inputs: Array) -> float:
+            return self._plan_cost(
+                means,
+                inputs,
+                goal,
+                previous_input=self._input_before(previous),
+                parameters=situation.parameters,
+            )
+
         limit = inf
         if decision.applicable:
             if self._has_tubes:
                 return decision  # which the last plan, moved on, may have left
-            cost = self._plan_cost(decision.means, decision.inputs, question)
-            limit = cost / (1.0 + _DEARER)
-        if self._plan_cost(means, inputs, question) >= limit:
+            limit = plan_cost(decision.means, decision.inputs) / (1.0 + _DEARER)
+        if plan_cost(means, inputs) >= limit:
             return decision
         gains = self.controller.gains(previous, situation.parameters)
         gains = np.concatenate([gains[1:], gains[-1:]])
+        question = self._question(situation._replace(reference=goal))
         states, inputs = self._foresight.roll_out(
             means, inputs, gains, situation.state, question
         )
-        if self._plan_cost(states, inputs, question) < limit:
-            return self._with_plan(decision, inputs, states)
+        if plan_cost(states, inputs) < limit:
+            return self._with_plan(decision, inputs, states, previous)
         return decision
 
-    def _with_plan(self, decision: Decision, inputs: Array, means: Array) -> Decision:
-        """Returns a decision for another plan, which is applicable."""
+    def _with_plan(
+        self,
+        decision: Decision,
+        inputs: Array,
+        means: Array,
+        previous: Decision | None,
+    ) -> Decision:
+        """Returns a decision for another plan, which is applicable.
+
+        Where the controller itself failed, its status says so, and the covariances are
+        those of the last plan: they depend on the time since the last measurement.
+        """
         covariances = decision.covariances
         if not decision.applicable:
             covariances = np.zeros((*means.shape, means.shape[1]))
+            if previous is not None and self._can_continue(previous):
+                covariances = previous.covariances
         changed = replace(
             decision,
             input=inputs[0],
@@ -677,23 +719,34 @@ class ManyStarts:
         )
         if decision.applicable:
             return changed
-        return replace(changed, status=Status.ITERATION_LIMIT, suboptimal=True)
+        return replace(changed, solution=None, suboptimal=True)
 
     def _nearest_turn(self, reference: Reference, end: Array) -> Reference:
         """Returns the turn of a reference whose end is nearest to a state (n,)."""
         turns = full_turns(end - reference.states[-1], self._angles)
         return turned(reference, turns)
 
-    def _plan_cost(self, means: Array, inputs: Array, question: Question) -> float:
-        """Returns the cost of a plan, violated constraints included.
+    def _plan_cost(
+        self,
+        means: Array,
+        inputs: Array,
+        reference: Reference,
+        previous_input: Array,
+        parameters: Any,
+    ) -> float:
+        """Returns the cost of means (H + 1, n) and inputs (H, m), all included.
 
-        It is infinite where it is not finite.
+        That is what outputs and violated constraints cost, too. It is infinite where it
+        is not finite.
         """
-        cost = self._tracking_cost(
-            means, inputs, question.reference, question.previous_input
-        )
-        functions = self._foresight.meter.functions(means, inputs, question.parameters)
-        cost += float(functions.sum())
+        reference_inputs = np.zeros_like(inputs)
+        if reference.inputs is not None:
+            reference_inputs = np.asarray(reference.inputs)
+        targets = np.asarray(reference.states[1:])
+        references = References(targets, reference_inputs, previous_input)
+        cost = evaluate_cost(self._weights, means, inputs, references, 1.0)
+        outputs, violations = self._foresight.meter.functions(means, inputs, parameters)
+        cost += float(outputs.sum() + violations.sum())
         return cost if np.isfinite(cost) else inf
 
     def _deadline(self) -> float:
@@ -701,26 +754,55 @@ class ManyStarts:
         return inf if self.budget is None else perf_counter() + self.budget
 
     def _cost(self, decision: Decision, reference: Reference) -> float:
-        """Returns the tracking cost of a decision's plan."""
-        return self._tracking_cost(
-            decision.means, decision.inputs, reference, decision.inputs[0]
+        """Returns the cost of a decision's plan from its first input on."""
+        return self._plan_cost(
+            decision.means,
+            decision.inputs,
+            reference,
+            previous_input=decision.inputs[0],
+            parameters=None,
         )
 
-    def _tracking_cost(
-        self, means: Array, inputs: Array, reference: Reference, previous_input: Array
+    def _judge(
+        self,
+        decision: Decision,
+        goal: Reference,
+        previous: Decision | None,
+        parameters: Any,
     ) -> float:
-        """Returns the tracking cost of means (H + 1, n) and inputs (H, m)."""
-        reference_inputs = np.zeros_like(inputs)
-        if reference.inputs is not None:
-            reference_inputs = np.asarray(reference.inputs)
-        targets = np.asarray(reference.states[1:])
-        references = References(targets, reference_inputs, previous_input)
-        return evaluate_cost(self._weights, means, inputs, references, 1.0)
+        """Returns the criterion of a decision.
 
-    def _judge(self, decision: Decision, goal: Reference) -> float:
-        """Returns the criterion of a decision; infinite where it is not applicable."""
-        value = self.criterion(decision, goal) if decision.applicable else inf
-        return value if np.isfinite(value) else inf
+        It is infinite where the decision is not applicable, or beyond a hard bound.
+        """
+        if not decision.applicable:
+            return inf
+        if not self._judges_flights:
+            value = self.criterion(decision, goal)
+            return value if np.isfinite(value) else inf
+        return self._plan_cost(
+            decision.means,
+            decision.inputs,
+            goal,
+            previous_input=self._input_before(previous),
+            parameters=parameters,
+        )
+
+    def _input_before(self, previous: Decision | None) -> Array:
+        """Returns the input (m,) of the last decision, or the one before the first."""
+        if previous is None:
+            return self.initial_input
+        return np.asarray(previous.input, dtype=float)
+
+    def _are_alike(self, inputs: Array, others: Array) -> bool:
+        """Tells whether two plans are one, but for the tolerance of their solves.
+
+        Each input (H, m) counts in its own range.
+        """
+        ranges = np.ptp(others, axis=0)
+        lower, upper = self.problem.inputs.first
+        still = np.where(np.isfinite(upper - lower), _STILL * (upper - lower), 0.0)
+        tolerances = _ALIKE * np.maximum(ranges, still)
+        return bool(np.allclose(inputs, others, atol=tolerances))
 
 
 def _is_set_point(reference: Reference) -> bool:
@@ -732,11 +814,6 @@ def _is_set_point(reference: Reference) -> bool:
         return True
     inputs = np.asarray(reference.inputs)
     return bool((inputs == inputs[0]).all())
-
-
-def _are_alike(inputs: Array, others: Array) -> bool:
-    """Tells whether two plans are one, but for the tolerance of their solves."""
-    return bool(np.allclose(inputs, others, atol=_ALIKE * np.ptp(others)))
 
 
 def _order(one: ModelFlight, other: ModelFlight) -> int:

@@ -328,6 +328,101 @@ def test_only_a_plan_that_misses_the_goal_is_given_up():
     assert many.searches == 0
 
 
+@pytest.mark.parametrize("penalty", ["elastic", "exact"])
+def test_a_start_beyond_a_soft_bound_is_searched_as_others_are(penalty):
+    """What leaving the bound costs says nothing of whether a plan ends at the goal."""
+    slow = [Box([-np.inf, -2.0], [np.inf, 2.0], penalty=penalty)]
+    settings = {"constraints": slow}
+    one = controller(pendulum(), [1.0, 0.01], [0.01], 30, **settings)
+    for rate, near in ((2.5, False), (0.0, True)):
+        many = CountedStarts(one, controller(pendulum(), [1.0, 0.01], [0.01], 30, 15))
+        state = Gaussian.certain(np.array([0.1 if near else np.pi, rate]))
+        reference = Reference(np.zeros(2))
+        many.control(state, reference, one.control(state, reference))
+        assert many.searches == (0 if near else 1)
+
+
+class Failing(GPMPC):
+    """Finds no plan from some step on."""
+
+    fails = False
+
+    def control(self, *arguments, **named):
+        decision = super().control(*arguments, **named)
+        if not self.fails:
+            return decision
+        nothing = np.full_like(decision.means, np.nan)
+        return replace(decision, means=nothing, status=Status.INFEASIBLE)
+
+
+def test_a_plan_that_is_kept_says_that_the_controller_failed():
+    one = Failing(
+        pendulum_posterior(),
+        Linearization(),
+        Problem(Tracking([1.0, 0.1], [0.05]), Box([-2.0], [2.0])),
+        12,
+        [0.0],
+    )
+    many = ManyStarts(one)
+    loop = ControlLoop(many)
+    state = np.array([0.2, 0.0])
+    loop.input(state, np.zeros(2))
+    last = loop.last.decision
+    one.fails = True
+    loop.input(last.means[1], np.zeros(2))
+    assert loop.last.status is Status.INFEASIBLE
+    decision = loop.last.decision
+    assert decision.applicable
+    assert decision.suboptimal
+    assert decision.solution is None
+    assert np.abs(last.covariances).max() > 0.0
+    assert np.array_equal(decision.covariances, last.covariances)
+
+
+def test_plans_that_differ_in_a_small_input_are_two():
+    """A thrust of a thousand newtons, and a wheel turned to the left or the right."""
+    two_inputs = Problem(
+        Tracking([1.0], [1e-6, 1.0], penalized="inputs"),
+        inputs=Box([0.0, -0.5], [1000.0, 0.5]),
+    )
+    model = KnownModel(lambda x, u: x + u.sum(-1, keepdim=True), 1, 2)
+    many = ManyStarts(GPMPC(model, Linearization(), two_inputs, 10, [0.0, 0.0]))
+    thrust = np.linspace(0.0, 1000.0, 10)
+    left = np.stack([thrust, np.full(10, 0.4)], axis=1)
+    assert not many._are_alike(left, left * [1.0, -1.0])
+    assert not many._are_alike(left, left * [0.5, 1.0])
+    assert many._are_alike(left, left + np.array([10.0, 1e-6]))
+    one = ManyStarts(controller(pendulum(), [1.0, 0.01], [0.01], 10))
+    swing = np.linspace(-1.0, 1.0, 10)[:, None]
+    assert one._are_alike(swing + 0.09, swing)
+    assert not one._are_alike(swing + 0.11, swing)
+
+
+def test_a_plan_to_a_reference_that_moves_is_judged_by_all_of_its_cost():
+    """By outputs, by bounds that it misses, and by the increment of its first input."""
+
+    def off_three(x, u, p):
+        return x[:, :1] - p
+
+    problem = Problem(
+        Tracking([0.0], [0.1]),
+        inputs=Box([-1.0], [1.0]),
+        constraints=[Box(None, [2.0], penalty=7.0)],
+        outputs=[LeastSquares(off_three, [1.0])],
+    )
+    model = KnownModel(lambda x, u: x + u, 1, 1)
+    means = PredictionSettings(covariance="none")
+    one = GPMPC(model, Linearization(), problem, 6, [-0.5], means)
+    reference = Reference(np.linspace(0.0, 0.01, 7)[:, None])
+    belief = Gaussian.certain(np.zeros(1))
+    plans = list(ManyStarts(one).plans(belief, reference, parameters=[4.0]))
+    for plan, value in plans:
+        outputs = ((plan.means[1:] - 4.0) ** 2).sum()
+        increments = 0.1 * (np.diff(plan.inputs[:, 0], prepend=-0.5) ** 2).sum()
+        missed = 7.0 * (plan.means[1:] - 2.0 - 1e-5).clip(0.0).sum()
+        assert value == pytest.approx(outputs + increments + missed, rel=1e-6)
+
+
 def test_a_spent_budget_leaves_the_controllers_own_plan():
     system = pendulum()
     many = pendulums(budget=1e-9)
