@@ -1,10 +1,10 @@
 """The checks of a flight's step, compiled.
 
-``judge_step`` takes a step into the memory of its flight and returns the first alarm.
-Functions ``_follow_*`` and ``_remember_*`` write the memory, each of them once a step,
-and ``judge_step`` itself counts the steps; ``_check_*`` only read. The tuple ``alarms``
-is the list of alarms, in the order in which they are named to the user. What they are
-for is told in ``_judgement``.
+``judge_step`` takes a step into the memory of its flight and leaves the first alarm
+there. Functions ``_follow_*`` and ``_remember_*`` write the memory, each of them once a
+step, and ``judge_step`` itself counts the steps; ``_check_*`` only read. The tuple
+``alarms`` is the list of alarms, in the order in which they are named to the user. What
+they are for is told in ``_judgement``.
 
 A measurement that is missing is NaN. It is no innovation, it tells nothing of its
 sensor, and the plant counts as where the last plan predicted it. Numbers beyond
@@ -49,6 +49,7 @@ _ROUNDING = 1e-9
 _MEDIAN = 0.455  # of a chi-square of one degree
 
 # Why a step is not healthy.
+MISFIT = -1  # its arrays do not fit each other, and it was not judged
 HEALTHY = 0
 INNOVATION = 1
 PROMISE = 2
@@ -77,7 +78,12 @@ STATE_MEMORY = np.dtype(
         ("ordered_changes", np.float64, _CHANGES),  # the same, from the smallest on
         ("sensor_variance", np.float64),  # the sensors' part of the innovations
         ("motion", np.float64),  # largest squared predicted motion, forgotten slowly
-        ("measured", np.float64),  # the last measurement
+        ("measured", np.float64),  # now; NaN where it is not
+        ("last_measured", np.float64),  # before, at any step
+        # by the last plan, which began one step ago; NaN without one
+        ("plan_start", np.float64),  # where it began
+        ("predicted", np.float64),  # where it led by now
+        ("predicted_variance", np.float64),
         ("repeats", np.float64),  # for how many steps the sensor has shown the same
         ("missed_moves", np.float64),  # those of them in which it was to change
         ("is_coarse", np.float64),  # 1 where it has gone on after showing the same
@@ -98,6 +104,10 @@ FLIGHT_MEMORY = np.dtype(
         ("since_nearer", np.int64),  # steps since the plant came nearer to it
         ("violated", np.int64),  # steps for which plans have missed a constraint
         ("lost", np.int64),  # why it is lost, or ``HEALTHY``
+        # the first alarm of the last step, as in ``Alarm``
+        ("reason", np.int64),
+        ("entry", np.int64),
+        ("value", np.float64),
         ("longest_way", np.float64),  # from the start to the reference's end
         ("distance_when_lost", np.float64),
         ("first_violation", np.float64),
@@ -143,11 +153,10 @@ class Reading(NamedTuple):
 
     measured: Array  # (n,)
     reference: Array  # from this step on, to its end or as far as known (H + 1, n)
-    last_means: Array  # of the plan before, which started one step ago (H + 1, n)
-    last_covariances: Array  # (H + 1, n, n); NaN without a plan
-    means: Array  # of the new plan (H + 1, n); NaN without one
+    means: Array  # of the plan (H + 1, n); anything without one
+    covariances: Array  # (H + 1, n, n)
     input: Array  # applied now (m,)
-    is_applied: bool  # whether the new plan is
+    is_applied: bool  # whether the plan is
     novelty: float
     violation: float
 
@@ -192,35 +201,63 @@ def new_state_memory(count: int) -> Array:
     """Returns the memory of states (count,) at the start of a flight."""
     states = np.zeros(count, STATE_MEMORY)
     states["ordered_changes"] = np.inf
-    unknown = ("innovation", "measured", "start", "horizon_end", "next_reference")
+    unknown = (
+        "innovation",
+        "last_measured",
+        "plan_start",
+        "predicted",
+        "predicted_variance",
+        "start",
+        "horizon_end",
+        "next_reference",
+    )
     for field in unknown:
         states[field] = np.nan
     return states
 
 
 @compiled(locked=True, allocates=False)
-def all_usual(values):
-    """Returns whether all numbers (d,) are such as are measured and planned."""
-    count = 0
-    for value in values:
-        count += abs(value) < UNMEASURED
-    return count == len(values)
+def judge_step(
+    settings,
+    memory,
+    measured,
+    reference,
+    means,
+    covariances,
+    input,
+    is_applied,
+    novelty,
+    violation,
+):
+    """Takes a step into the memory; returns the reason of its first alarm.
 
-
-@compiled(locked=True, allocates=False)
-def judge_step(settings, memory, reading):
-    """Takes a step into the memory; returns the first alarm of the checks."""
+    The last eight arguments are those of a ``Reading``, which Python would take half as
+    long to make as this to judge.
+    """
+    reading = Reading(
+        measured,
+        reference,
+        means,
+        covariances,
+        input,
+        is_applied,
+        novelty,
+        violation,
+    )
+    if not _fit_each_other(memory, reading):
+        return MISFIT
     flight = memory.flight[0]
-    horizon = len(reading.means) - 1
+    horizon = len(means) - 1
+    _remember_measurement(memory, measured)
     planned_squares, promised = _plan_distances(settings, reading)
     if flight.look_ahead == 0 and reading.is_applied:
         flight.look_ahead = min(horizon, _LONG)
 
     # The order counts: sensor variances come from the innovations, distances need these
     # variances, and a promise is followed after the news that may withdraw it.
-    innovation, bias = _follow_innovations(settings, memory, reading)
-    frozen = _follow_sensors(settings, memory, reading)
-    distance = _follow_distance(settings, memory, reading)
+    innovation, bias = _follow_innovations(settings, memory)
+    frozen = _follow_sensors(settings, memory)
+    distance = _follow_distance(settings, memory, reading.reference)
     _remember_reference(settings, memory, reading.reference)
     _remember_first_cost(flight, planned_squares)
     promise_ratio = _follow_promise(flight, distance, promised, horizon)
@@ -247,8 +284,13 @@ def judge_step(settings, memory, reading):
         standing,
         saturated,
     )
+    _remember_plan(memory, reading)
     flight.step += 1
-    return _first(alarms)
+    alarm = _first(alarms)
+    flight.reason = alarm.reason
+    flight.entry = alarm.entry
+    flight.value = alarm.value
+    return alarm.reason
 
 
 @njit_noalloc
@@ -261,7 +303,50 @@ def _first(alarms):
 
 
 @njit_noalloc
-def _follow_innovations(settings, memory, reading):
+def _fit_each_other(memory, reading):
+    """Whether arrays have as many states, inputs and stages as others."""
+    n = len(memory.states)
+    stages = len(reading.means)
+    return (
+        len(reading.measured) == n
+        and len(reading.reference) > 0
+        and reading.reference.shape[1] == n
+        and stages > 1  # the next state is one of them
+        and reading.means.shape[1] == n
+        and reading.covariances.shape == (stages, n, n)
+        and len(reading.input) == len(memory.at_bound)
+    )
+
+
+@njit_noalloc
+def _usual(value):
+    """A number such as are measured and planned, or else NaN."""
+    return value if abs(value) < UNMEASURED else np.nan
+
+
+@njit_noalloc
+def _remember_measurement(memory, measured):
+    """Remembers what is measured now."""
+    for i in range(len(measured)):
+        memory.states[i].measured = _usual(measured[i])
+
+
+@njit_noalloc
+def _remember_plan(memory, reading):
+    """Remembers where a plan begins, and what it predicts for the next step."""
+    for i in range(len(memory.states)):
+        state = memory.states[i]
+        state.plan_start = np.nan
+        state.predicted = np.nan
+        state.predicted_variance = np.nan
+        if reading.is_applied:
+            state.plan_start = _usual(reading.means[0, i])
+            state.predicted = _usual(reading.means[1, i])
+            state.predicted_variance = reading.covariances[1, i, i]
+
+
+@njit_noalloc
+def _follow_innovations(settings, memory):
     """The states whose innovations are no chance: by a window's squares, and by bias.
 
     The first alarm is that of the largest mean square in a window, the second that of
@@ -276,10 +361,10 @@ def _follow_innovations(settings, memory, reading):
     has_change = False
     for i in range(len(memory.states)):
         state = memory.states[i]
-        innovation = _wrapped(
-            reading.measured[i] - reading.last_means[1, i], settings.angles[i]
+        innovation = _wrapped(state.measured - state.predicted, settings.angles[i])
+        ratio, deviation = _follow_innovation(
+            state, innovation, settings.model_noise[i]
         )
-        ratio, deviation = _follow_innovation(settings, state, reading, i)
         slot = flight.step % WINDOW
         state.ratio += ratio - state.ratios[slot]
         state.ratios[slot] = ratio
@@ -299,7 +384,7 @@ def _follow_innovations(settings, memory, reading):
 
 
 @njit_noalloc
-def _follow_innovation(settings, state, reading, i):
+def _follow_innovation(state, innovation, model_noise):
     """A state's squared innovation over its variance, and itself over its deviation.
 
     The variance is the predicted one, the noise that the model has learned, that of
@@ -311,17 +396,15 @@ def _follow_innovation(settings, state, reading, i):
     is_judged = state.change_count >= _FEWEST
     if is_judged:
         state.sensor_variance = _sensor_variance(state)
-    expected = reading.last_means[1, i]
-    innovation = _wrapped(reading.measured[i] - expected, settings.angles[i])
     if innovation != innovation:
         return 0.0, 0.0
-    motion = expected - reading.last_means[0, i]
+    motion = state.predicted - state.plan_start
     motion = max(motion * motion, _FORGETTING * state.motion)
     state.motion = motion
     if not is_judged:
         return 0.0, 0.0
-    size = _ROUNDING * max(1.0, abs(reading.measured[i]))
-    variance = size * size + reading.last_covariances[1, i, i] + settings.model_noise[i]
+    size = _ROUNDING * max(1.0, abs(state.measured))
+    variance = size * size + state.predicted_variance + model_noise
     variance += _MISSED_MOTION * _MISSED_MOTION * motion
     if variance != variance:  # the plan does not say how uncertain it is
         return 0.0, 0.0
@@ -393,31 +476,30 @@ def _find(ordered, value):
 
 
 @njit_noalloc
-def _follow_sensors(settings, memory, reading):
+def _follow_sensors(settings, memory):
     """A state that is measured the same to the last digit while others change.
 
     A sensor that has shown the same before, and then gone on, has coarse steps: it may.
     So may one without noise, whose state was to stay where it is.
     """
     changing = 0
-    measured = reading.measured
-    for i in range(len(measured)):
+    for i in range(len(memory.states)):
         state = memory.states[i]
-        if measured[i] != measured[i]:
+        if state.measured != state.measured:
             continue
-        if measured[i] == state.measured:
+        if state.measured == state.last_measured:
             state.repeats += 1.0
-            state.missed_moves += _was_to_change(settings, state, reading, i)
+            state.missed_moves += _was_to_change(settings, state, i)
         else:
             if state.repeats > 0.0:
                 state.is_coarse = 1.0
             state.repeats = 0.0
             state.missed_moves = 0.0
             changing += 1
-        state.measured = measured[i]
+        state.last_measured = state.measured
     if changing == 0 or memory.flight[0].changes < _FEWEST:
         return _WELL
-    for i in range(len(measured)):
+    for i in range(len(memory.states)):
         state = memory.states[i]
         if state.missed_moves >= WINDOW // 2 and state.is_coarse == 0.0:
             return Alarm(FROZEN, i, state.repeats)
@@ -425,21 +507,20 @@ def _follow_sensors(settings, memory, reading):
 
 
 @njit_noalloc
-def _was_to_change(settings, state, reading, i):
+def _was_to_change(settings, state, i):
     """Whether a sensor was to show another number, by its noise or by the last plan.
 
     A plan that predicts nothing does not say that the state was to stay.
     """
-    predicted = reading.last_means[1, i]
-    move = _wrapped(predicted - reading.measured[i], settings.angles[i])
-    size = _ROUNDING * max(1.0, abs(reading.measured[i]))
-    variance = reading.last_covariances[1, i, i] + settings.model_noise[i]
+    move = _wrapped(state.predicted - state.measured, settings.angles[i])
+    size = _ROUNDING * max(1.0, abs(state.measured))
+    variance = state.predicted_variance + settings.model_noise[i]
     is_noisy = state.sensor_variance > size * size
     return is_noisy or not move * move <= variance + size * size
 
 
 @njit_noalloc
-def _follow_distance(settings, memory, reading):
+def _follow_distance(settings, memory, reference):
     """The distance from the reference in the cost's metric, and the least that matters.
 
     No distance matters that is small beside the way from the start to the reference, or
@@ -447,32 +528,33 @@ def _follow_distance(settings, memory, reading):
     infinite before any is known.
     """
     flight = memory.flight[0]
-    n = len(reading.measured)
+    n = len(memory.states)
     for i in range(n):
         state = memory.states[i]
         if state.start != state.start:
-            state.start = reading.measured[i]
-    now = reading.reference[0]
-    end = reading.reference[-1]
+            state.start = state.measured
+    now = reference[0]
+    end = reference[-1]
     square = 0.0
     way_square = 0.0
     noise = 0.0
     for i in range(n):
         state = memory.states[i]
-        present = _present(reading, i)
+        present = _present(state)
         off = _wrapped(present - now[i], settings.angles[i])
         way = _wrapped(end[i] - state.start, settings.angles[i])
         for j in range(n):
             weight = settings.weights[i, j]
             if weight != 0.0:
-                off_j = _wrapped(_present(reading, j) - now[j], settings.angles[j])
+                off_j = _wrapped(
+                    _present(memory.states[j]) - now[j], settings.angles[j]
+                )
                 square += weight * off * off_j
                 way_j = _wrapped(end[j] - memory.states[j].start, settings.angles[j])
                 way_square += weight * way * way_j
         variance = settings.model_noise[i] + state.sensor_variance
-        predicted = reading.last_covariances[1, i, i]
-        if predicted == predicted:
-            variance += predicted
+        if state.predicted_variance == state.predicted_variance:
+            variance += state.predicted_variance
         size = _ROUNDING * max(1.0, abs(present))
         noise += settings.weights[i, i] * (variance + size * size)
     if way_square == way_square:
@@ -487,10 +569,10 @@ def _follow_distance(settings, memory, reading):
 
 
 @njit_noalloc
-def _present(reading, i):
+def _present(state):
     """Where a state is: as it was measured, or else as the last plan predicted it."""
-    measured = reading.measured[i]
-    return measured if measured == measured else reading.last_means[1, i]
+    is_measured = state.measured == state.measured
+    return state.measured if is_measured else state.predicted
 
 
 @njit_noalloc
@@ -567,10 +649,12 @@ def _plan_distances(settings, reading):
         weights = settings.terminal if k == H - 1 else settings.weights
         target = references[min(k + 1, len(references) - 1)]
         for i in range(n):
-            off = _wrapped(means[k + 1, i] - target[i], settings.angles[i])
+            mean = _usual(means[k + 1, i])
+            off = _wrapped(mean - target[i], settings.angles[i])
             for j in range(n):
                 if weights[i, j] != 0.0:
-                    off_j = _wrapped(means[k + 1, j] - target[j], settings.angles[j])
+                    mean_j = _usual(means[k + 1, j])
+                    off_j = _wrapped(mean_j - target[j], settings.angles[j])
                     total += weights[i, j] * off * off_j
         if k == _LONG - 1:
             first = total

@@ -26,11 +26,10 @@ checks, in their order, are in ``_flight_checks``.
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, NoReturn
 
 import numpy as np
 
-from gpmpc._arrays import is_measured
 from gpmpc._dynamics import to_array
 from gpmpc.exceptions import ShapeError, UnsupportedModel
 from gpmpc.mpc import _flight_checks as checks
@@ -138,12 +137,12 @@ class FlightJudge:
         angles[list(problem.cost.angle_indices)] = 1.0
         model_noise = np.zeros(n)
         if noise is not None:
-            model_noise = np.asarray(noise, dtype=float)
+            model_noise = _float64(noise)
             _check_shape("noise", model_noise.shape, (n,))
         self._settings = checks.Settings(
             weights=_float64(problem.cost.Q.reshape(-1, n, n)[0]),
             terminal=_float64(problem.cost.terminal),
-            model_noise=_float64(model_noise),
+            model_noise=model_noise,
             angles=angles,
             lower=_float64(lower),
             upper=_float64(upper),
@@ -157,11 +156,9 @@ class FlightJudge:
         self._constrained = bool(problem.constraints)
         self._states = tuple(names[0]) or tuple(f"state {i}" for i in range(n))
         self._inputs = tuple(names[1]) or tuple(f"input {j}" for j in range(m))
+        self._no_input = np.full(m, np.nan)
         self._no_means = np.full((2, n), np.nan)
         self._no_covariances = np.full((2, n, n), np.nan)
-        self._no_input = np.full(m, np.nan)
-        self._means = self._no_means  # of the plan that was applied last
-        self._covariances = self._no_covariances
         self.last = Judgement()
 
     @classmethod
@@ -204,65 +201,89 @@ class FlightJudge:
         Raises:
             ShapeError: One of them is of another number of states or inputs.
         """
-        n = self._no_means.shape[1]
         measured = _float64(measured)
-        _check_shape("measured", measured.shape, (n,))
-        measured = _usual(measured)
         references = _float64(reference)
         if references.ndim == 1:
             references = references[None]
-        if references.ndim != 2 or not len(references) or references.shape[1] != n:
-            got = references.shape
-            raise ShapeError(f"reference must be (H + 1, {n}) or ({n},); got {got}")
         input = self._no_input
         means = self._no_means
         covariances = self._no_covariances
         novelty = math.nan
         violation = 0.0
+        is_applied = decision is not None and decision.applicable
         if decision is not None:
-            input = _float64(decision.input)
-            _check_shape("decision.input", input.shape, self._no_input.shape)
-            if decision.applicable:
-                means = _float64(decision.means)
-                covariances = _float64(decision.covariances)
-                stages = max(len(means), 2)  # the next state is one of them
-                _check_shape("decision.means", means.shape, (stages, n))
-                _check_shape("decision.covariances", covariances.shape, (stages, n, n))
-                means = _usual(means)
-                # One that would have to be measured first is not worth the time here.
-                if not callable(decision.plan_novelty):
-                    novelty = float(decision.plan_novelty)
-                if self._constrained:
-                    violation = float(decision.violation)
-        reading = checks.Reading(
-            measured=measured,
-            reference=references,
-            last_means=self._means,
-            last_covariances=self._covariances,
-            means=means,
-            input=input,
-            is_applied=decision is not None and decision.applicable,
-            novelty=novelty,
-            violation=violation,
+            input = decision.input  # a copy of its own, of float64
+        if decision is not None and is_applied:
+            means = _float64(decision.means)
+            covariances = _float64(decision.covariances)
+            # One that would have to be measured first is not worth the time here.
+            if not callable(decision.plan_novelty):
+                novelty = float(decision.plan_novelty)
+            if self._constrained:
+                violation = float(decision.violation)
+        reason = checks.MISFIT
+        has_right_axes = (
+            measured.ndim == 1
+            and references.ndim == 2
+            and means.ndim == 2
+            and covariances.ndim == 3
+            and input.ndim == 1
         )
-        alarm = checks.judge_step.unchecked(self._settings, self._memory, reading)
-        self._means = means
-        self._covariances = covariances
-        self.last = _ALL_WELL
-        if alarm.reason != checks.HEALTHY:
-            self.last = self._in_words(alarm)
+        if has_right_axes:  # else compiled code must not see them
+            reason = checks.judge_step.unchecked(
+                self._settings,
+                self._memory,
+                measured=measured,
+                reference=references,
+                means=means,
+                covariances=covariances,
+                input=input,
+                is_applied=is_applied,
+                novelty=novelty,
+                violation=violation,
+            )
+        if reason == checks.HEALTHY:
+            self.last = _ALL_WELL
+        elif reason == checks.MISFIT:
+            self._refuse_shapes(measured, references, means, covariances, input)
+        else:
+            self.last = self._alarm_in_words()
         return self.last
 
-    def _in_words(self, alarm: checks.Alarm) -> Judgement:
-        """Returns the judgement that an alarm stands for."""
-        words = _WORDS[alarm.reason]
-        if alarm.reason == checks.CLIMBING and alarm.value < 1.0:
+    def _refuse_shapes(
+        self,
+        measured: Array,
+        references: Array,
+        means: Array,
+        covariances: Array,
+        input: Array,
+    ) -> NoReturn:
+        """Raises ``ShapeError``: one of the arrays is of another shape than the rest.
+
+        Compiled code compares them, in a tenth of the time that this takes.
+        """
+        n = self._no_means.shape[1]
+        stages = max(len(means), 2)  # the next state is one of them
+        _check_shape("measured", measured.shape, (n,))
+        _check_shape("decision.input", input.shape, self._no_input.shape)
+        _check_shape("decision.means", means.shape, (stages, n))
+        _check_shape("decision.covariances", covariances.shape, (stages, n, n))
+        got = references.shape
+        raise ShapeError(f"reference must be (H + 1, {n}) or ({n},); got {got}")
+
+    def _alarm_in_words(self) -> Judgement:
+        """Returns the judgement that the alarm of the last step stands for."""
+        alarm = self._memory.flight[0]
+        reason = int(alarm["reason"])
+        value = float(alarm["value"])
+        words = _WORDS[reason]
+        if reason == checks.CLIMBING and value < 1.0:
             words = _CLIMBING_BELOW_THE_FIRST
-        if alarm.reason in (checks.AWAY, checks.RISING):
-            return Judgement("lost", words.format(value=alarm.value))
-        names = self._inputs if alarm.reason == checks.SATURATED else self._states
-        reason = words.format(name=names[alarm.entry], value=alarm.value)
-        return Judgement("suspicious", reason)
+        if reason in (checks.AWAY, checks.RISING):
+            return Judgement("lost", words.format(value=value))
+        names = self._inputs if reason == checks.SATURATED else self._states
+        name = names[alarm["entry"]]
+        return Judgement("suspicious", words.format(name=name, value=value))
 
 
 def _learned_noise(controller: Any) -> Array | None:
@@ -292,27 +313,17 @@ _ALL_WELL = Judgement()
 
 
 def _check_shape(name: str, got: tuple[int, ...], expected: tuple[int, ...]) -> None:
-    """Raises ``ShapeError`` unless compiled code may read an array unchecked."""
+    """Raises ``ShapeError`` unless an array has the expected shape."""
     if got != expected:
         raise ShapeError(f"{name} must be {expected}; got {got}")
 
 
 def _float64(values: Any) -> Array:
     """Returns values as a contiguous array of float64, without a copy if they are."""
-    is_plain = type(values) is np.ndarray and values.dtype is _FLOAT64
+    is_plain = type(values) is Array and values.dtype is _FLOAT64
     if is_plain and values.flags.c_contiguous:
         return values
     return np.ascontiguousarray(values, dtype=np.float64)
-
-
-def _usual(values: Any) -> Array:
-    """Returns numbers, without a copy if they are such as are measured and planned.
-
-    Others are NaN: what is not finite, and what has no square.
-    """
-    if checks.all_usual.unchecked(values.ravel()):
-        return values
-    return np.where(is_measured(values), values, np.nan)
 
 
 # The words for plans that cost more again, but less than the first one still.
