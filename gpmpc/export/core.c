@@ -1241,15 +1241,31 @@ static void write_misses(const gpmpc_problem *problem, const gpmpc_solution *sol
 #endif
 }
 
-/* Whether all elastic rows are kept. */
-static int keeps_elastic_rows(const real *misses)
+/* Finds the elastic rows that are missed, which give way; returns how many. */
+static int find_rows_that_give_way(const real *misses, int *gives_way)
 {
+    int count = 0;
+    int k, e;
+    for (e = 0; e < r; e++) {
+        gives_way[e] = 0;
+        for (k = 0; k < H; k++)
+            if (row_is_elastic[e] && misses[k * r + e] > KEPT)
+                gives_way[e] = 1;
+        count += gives_way[e];
+    }
+    return count;
+}
+
+/* Whether rows that give way are missed early on the horizon rather than late. */
+static int are_kept_again(const real *misses, const int *gives_way)
+{
+    real moment = 0;
     int k, e;
     for (k = 0; k < H; k++)
         for (e = 0; e < r; e++)
-            if (row_is_elastic[e] && misses[k * r + e] > KEPT)
-                return 0;
-    return 1;
+            if (gives_way[e])
+                moment += (k - REAL(0.5) * (H - 1)) * larger(0, misses[k * r + e]);
+    return moment <= 0;
 }
 
 /* Price of a row that does not count: it keeps its place among the others. */
@@ -1257,14 +1273,17 @@ static int keeps_elastic_rows(const real *misses)
 
 /* What elastic rows that cannot be kept may cost. */
 typedef struct {
-    real least_price; /* under which no plan outweighs the cost */
-    real extra_cost;  /* of a plan under a higher price, beside that without them */
+    real least_price;  /* under which no plan outweighs the cost */
+    real lowest_price; /* of those that are tried for a plan that goes on */
+    real extra_cost;   /* of such a plan, beside that without them */
 } elastic_limits;
 
 /* Returns the limits of the price of elastic rows (gpmpc/mpc/_elastic.py): with cost J0
    and violations V0 of the plan without them,
-   least price = 2 (J + ..) / V0,   J0 <= J <= 2 J0,   extra cost = (J0 + ..) / 10 */
+   least price = 2 (J + ..) / V0,   J0 <= J <= 2 J0,   extra cost = (J0 + ..) / 10
+   where they are kept again, else lower prices are tried, too, for J0 / 10. */
 static elastic_limits limits_of_price(const gpmpc_problem *problem, const real *misses,
+                                      const int *gives_way, int kept_again,
                                       real free_cost, real guess_cost, real exact_price)
 {
     elastic_limits limits;
@@ -1281,7 +1300,7 @@ static elastic_limits limits_of_price(const gpmpc_problem *problem, const real *
             real weight = 0;
             real largest = 0;
             real square;
-            if (!row_is_elastic[e] || !(miss > 0))
+            if (!gives_way[e] || !(miss > 0))
                 continue;
             for (i = 0; i < n; i++) {
                 weight += g[i] * dot(Q + i * n, g, n);
@@ -1290,29 +1309,44 @@ static elastic_limits limits_of_price(const gpmpc_problem *problem, const real *
             if (!(largest > 0))
                 largest = exact_price / REAL(1e6);
             square = dot(g, g, n);
-            largest *= square; /* counts where the cost does not weigh the direction */
-            if (!(weight > REAL(1e-12) * largest))
-                weight = largest;
-            square = larger(square, REAL(1e-12));
+            /* counts where the cost does not weigh the direction */
+            if (!(weight > REAL(1e-12) * largest * square))
+                weight = largest * square;
+#if GPMPC_SMOOTH
+            {
+                const real *by_input = problem->D[k][e];
+                real input_square = dot(by_input, by_input, m);
+                weight += largest * input_square;
+                square += input_square;
+            }
+#endif
+            if (!(square > 0))
+                square = 1;
             sum_of_misses += miss;
             beside += weight / (square * square) * miss * miss;
         }
     cost += beside;
     price = larger(2 * cost / larger(sum_of_misses, REAL(1e-12)), NO_PRICE);
     /* of few digits: a quarter of a power of two */
-    limits.least_price =
-        POW(2, FLOOR(4 * LOG(price) / REAL(0.6931471805599453) + REAL(0.5)) / 4);
-    limits.extra_cost = REAL(0.1) * (free_cost + beside);
+    price = POW(2, FLOOR(4 * LOG(price) / REAL(0.6931471805599453) + REAL(0.5)) / 4);
+    limits.least_price = price;
+    if (kept_again) {
+        limits.lowest_price = price;
+        limits.extra_cost = REAL(0.1) * (free_cost + beside);
+    } else {
+        limits.lowest_price = larger(price / 256, NO_PRICE);
+        limits.extra_cost = REAL(0.1) * free_cost;
+    }
     return limits;
 }
 
-/* Sets the price of the elastic rows. */
-static void set_elastic_price(gpmpc_problem *problem, real price)
+/* Sets the price of the rows that give way, the exact one at most. */
+static void set_elastic_price(gpmpc_problem *problem, const int *gives_way, real price)
 {
     int e;
     for (e = 0; e < r; e++)
-        if (row_is_elastic[e])
-            problem->prices[e] = price;
+        if (gives_way[e])
+            problem->prices[e] = smaller(price, row_prices[e]);
 }
 
 /* What it costs to roll the model out along the plan of a solution: infinite where that
@@ -1330,25 +1364,42 @@ static real cost_when_followed(gpmpc_controller *controller,
     return cost_of_plan(problem, states, inputs);
 }
 
+/* Solves the program once more, under another price of the rows that give way. Where
+   that is not solved, the solution under the exact one stays. */
+static void solve_cheaper(gpmpc_controller *controller, const int *gives_way,
+                          real price)
+{
+    gpmpc_problem *problem = &controller->problem;
+    gpmpc_solution *solution = &controller->candidate;
+    gpmpc_solution *cheaper = &controller->elastic;
+    set_elastic_price(problem, gives_way, price);
+    solve(problem, &controller->program, solution, cheaper);
+    if (cheaper->status == GPMPC_SOLVED)
+        *solution = *cheaper;
+    else
+        set_elastic_price(problem, gives_way, LARGEST);
+}
+
 /* Solves the program for the highest price of elastic rows whose plan is affordable:
-   the exact one, or one of a few between the least and that; the least where none is. */
-static void raise_elastic_price(gpmpc_controller *controller, real least_price,
-                                real highest, real affordable_cost)
+   the exact one, or one of a few between the lowest and that; the lowest where none is.
+ */
+static void raise_elastic_price(gpmpc_controller *controller, const int *gives_way,
+                                real lowest_price, real highest, real affordable_cost)
 {
     gpmpc_problem *problem = &controller->problem;
     gpmpc_program *program = &controller->program;
     gpmpc_solution *solution = &controller->candidate;
     gpmpc_solution *trial = &controller->elastic;
-    real price = smaller(least_price, highest);
+    real price = smaller(lowest_price, highest);
     int is_affordable = 0;
     int i;
     if (cost_when_followed(controller, solution) <= affordable_cost) {
-        set_elastic_price(problem, highest);
+        set_elastic_price(problem, gives_way, highest);
         return;
     }
     for (i = 0; i < 5; i++) {
         real middle = SQRT(price * highest);
-        set_elastic_price(problem, middle);
+        set_elastic_price(problem, gives_way, middle);
         solve(problem, program, solution, trial);
         if (trial->status == GPMPC_SOLVED
             && cost_when_followed(controller, trial) <= affordable_cost) {
@@ -1359,9 +1410,10 @@ static void raise_elastic_price(gpmpc_controller *controller, real least_price,
             highest = middle;
         }
     }
-    set_elastic_price(problem, price);
-    if (!is_affordable)
-        solve(problem, program, solution, solution);
+    if (is_affordable)
+        set_elastic_price(problem, gives_way, price);
+    else
+        solve_cheaper(controller, gives_way, price);
 }
 
 /* Replaces a solution that misses an elastic row by the one under the price that the
@@ -1375,39 +1427,42 @@ static void solve_elastic(gpmpc_controller *controller)
     real misses[GPMPC_STATE_ROWS];
     real inputs[GPMPC_SIZE];
     real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
+    int gives_way[r];
     real guess_cost, affordable_cost;
     real highest = 0; /* price */
+    int kept_again;
     int e;
     if (solution->status != GPMPC_SOLVED)
         return;
     write_misses(problem, solution, misses);
-    if (keeps_elastic_rows(misses))
+    if (!find_rows_that_give_way(misses, gives_way))
         return;
+    kept_again = are_kept_again(misses, gives_way);
     for (e = 0; e < r; e++)
-        if (row_is_elastic[e])
+        if (gives_way[e])
             highest = larger(highest, problem->prices[e]);
     guess_cost = cost_of_plan(problem, &problem->states[0][0], &problem->inputs[0][0]);
-    set_elastic_price(problem, NO_PRICE);
+    set_elastic_price(problem, gives_way, NO_PRICE);
     solve(problem, &controller->program, solution, without);
     if (without->status != GPMPC_SOLVED) {
-        set_elastic_price(problem, highest);
+        set_elastic_price(problem, gives_way, highest);
         return;
     }
     expand(problem, without->x, inputs, states);
     write_misses(problem, without, misses);
-    limits = limits_of_price(problem, misses, cost_of_plan(problem, states, inputs),
-                             guess_cost, highest);
+    limits = limits_of_price(problem, misses, gives_way, kept_again,
+                             cost_of_plan(problem, states, inputs), guess_cost,
+                             highest);
     if (!problem->has_feedback)
         write_gains(problem);
     affordable_cost = INFINITY;
     if (controller->has_plan)
         affordable_cost = cost_when_followed(controller, without) + limits.extra_cost;
-    if (is_finite(affordable_cost)) {
-        raise_elastic_price(controller, limits.least_price, highest, affordable_cost);
-        return;
-    }
-    set_elastic_price(problem, smaller(limits.least_price, highest));
-    solve(problem, &controller->program, solution, solution);
+    if (is_finite(affordable_cost))
+        raise_elastic_price(controller, gives_way, limits.lowest_price, highest,
+                            affordable_cost);
+    else
+        solve_cheaper(controller, gives_way, limits.least_price);
 }
 #endif
 

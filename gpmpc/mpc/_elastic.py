@@ -14,7 +14,8 @@ that is what its violations may cost. J is the cost of the last plan within thes
 limits: where that keeps the bound at some cost, the bound is worth more. A plan that
 costs nothing has no scale: J_move is what it would cost to be beside its reference by
 its violations. A direction that the cost does not weigh counts there as its largest
-weight does: else a bound in it would count for nothing.
+weight does, and so does one of the inputs, whose own weight says nothing of what they
+move: else a bound in it would count for nothing.
 
 This is the least price. The linearised program may promise more than the vehicle can
 do: as long as a plan that the model itself rolls out costs at most a SHARE of J0 more,
@@ -22,6 +23,14 @@ the bound may be dearer. Of a few prices up to the exact one the highest such is
 for a first plan, whose guess says little about costs, the least. It is the least, too,
 for what follows on a plan that missed such bounds by more than its program, under the
 exact price, had promised: what the program sees is not what the model does.
+
+A detour is worth it where the bound is kept again at its end. Where violations under
+the exact price grow along the horizon, as where a model leaves its data and tubes
+become wider than the lane, it is not: paid for at every step, it has led a car away
+that came back without the lane. There the SHARE of J0 is all that the bound may cost,
+and prices below the least are among those that are tried.
+
+Bounds that the exact price does keep are none of these: theirs stays.
 """
 
 from typing import NamedTuple
@@ -37,8 +46,9 @@ Array = np.ndarray
 WORTH = 2.0
 # With .05 a car comes back to its lane later; with .25 one of a poor model was lost.
 SHARE = 0.1
-TRIALS = 5  # prices between the least and the exact one
+TRIALS = 5  # prices between the lowest and the exact one
 NO_PRICE = 1e-9  # of a row that does not count: it keeps its place among the others
+_LOWEST = 2.0**-8  # of the least price, where violations grow along the horizon
 _TINY = 1e-12
 
 
@@ -47,51 +57,74 @@ class ElasticLimits(NamedTuple):
 
     Attributes:
         least_price: Under which no plan outweighs what the cost is for.
-        extra_cost: What a plan under a higher price may cost more than without them.
+        lowest_price: Of those that are tried for a plan that goes on.
+        extra_cost: What such a plan may cost more than without them.
     """
 
     least_price: float
+    lowest_price: float
     extra_cost: float
 
 
 def elastic_limits(
-    local: LocalProblem,
+    free: LocalProblem,
     free_cost: float,
     guess_cost: float,
-    elastic: Array,
+    rows: Array,
+    are_kept_again: bool,
     Q: Array,
     largest_weight: float,
 ) -> ElasticLimits:
     """Returns the limits of the price of elastic rows, from the plan without them.
 
     Args:
-        local: With the plan that minimises the cost alone.
+        free: With the plan that minimises the cost without these rows.
         free_cost: Of that plan, J0.
         guess_cost: Of the first guess, such as the last plan.
-        elastic: Which of the r rows are elastic (r,).
+        rows: Which of the r rows they are (r,).
+        are_kept_again: See ``are_kept_again``.
         Q: Weight of the states (n, n), or of those of each stage (H, n, n).
         largest_weight: Of the whole cost, which counts where Q is zero.
     """
-    missed = local.row_violations(elastic)
-    gradients = _by_stage(local.rows.E, len(missed))
-    gradients = gradients[:, elastic, : Q.shape[-1]]
+    missed = free.row_violations()[:, rows]
+    H = len(missed)
     n = Q.shape[-1]
-    of_stages = _by_stage(Q.reshape(-1, n, n), len(missed))
-    weights = np.einsum("kri,kij,krj->kr", gradients, of_stages, gradients)
-    squares = (gradients**2).sum(axis=2)
-    diagonals = np.diagonal(of_stages, axis1=1, axis2=2)
+    by_state = _by_stage(free.rows.E, H)[:, rows, :n]
+    state_weights = _by_stage(Q.reshape(-1, n, n), H)
+    diagonals = np.diagonal(state_weights, axis1=1, axis2=2)
     largest = diagonals.max(axis=1, keepdims=True)
-    largest = np.where(largest > 0.0, largest, largest_weight) * squares
-    weights = np.where(weights > _TINY * largest, weights, largest)
+    largest = np.where(largest > 0.0, largest, largest_weight)
+    squares = (by_state**2).sum(axis=2)
+    weights = np.einsum("kri,kij,krj->kr", by_state, state_weights, by_state)
+    weights = np.where(weights > _TINY * largest * squares, weights, largest * squares)
+    if len(free.rows.D):
+        input_squares = (free.rows.D[:, rows] ** 2).sum(axis=2)
+        weights = weights + largest * input_squares
+        squares = squares + input_squares
     # The cheapest move by a violation v along a gradient g has the size v / |g|.
-    moving_costs = weights / np.maximum(squares, _TINY) ** 2 * missed**2
-    moving_cost = moving_costs.sum()
+    lengths = np.where(squares > 0.0, squares, 1.0)
+    moving_cost = (weights / lengths**2 * missed**2).sum()
     cost = min(max(free_cost, guess_cost), 2.0 * free_cost) + moving_cost
-    least_price = max(WORTH * cost / max(missed.sum(), _TINY), NO_PRICE)
+    least_price = WORTH * cost / max(missed.sum(), _TINY)
+    least_price = _rounded(max(least_price, NO_PRICE))
+    if are_kept_again:
+        return ElasticLimits(
+            least_price=least_price,
+            lowest_price=least_price,
+            extra_cost=SHARE * (free_cost + moving_cost),
+        )
     return ElasticLimits(
-        least_price=_rounded(least_price),
-        extra_cost=SHARE * (free_cost + moving_cost),
+        least_price=least_price,
+        lowest_price=max(_LOWEST * least_price, NO_PRICE),
+        extra_cost=SHARE * free_cost,
     )
+
+
+def are_kept_again(violations: Array) -> bool:
+    """Returns whether rows are missed (H, r) early on the horizon rather than late."""
+    by_stage = violations.sum(axis=1)
+    centred_stages = np.arange(len(by_stage)) - (len(by_stage) - 1) / 2
+    return bool(centred_stages @ by_stage <= 0.0)
 
 
 def _rounded(price: float) -> float:

@@ -173,15 +173,8 @@ class LocalProblem(NamedTuple):
         """Returns by how much the plan misses a bound, at most."""
         return largest_violation.unchecked(self.rows, bounds, self.plan, previous_input)
 
-    def row_violations(self, chosen: Array) -> Array:
-        """Returns by how much the plan misses chosen ones of the r rows.
-
-        Args:
-            chosen: Which of them (r,).
-
-        Returns:
-            The violations (H, number of chosen rows), zero where rows are kept.
-        """
+    def row_violations(self) -> Array:
+        """Returns by how much the plan misses each row (H, r), zero inside."""
         E, D, lower, upper = self.rows
         states = self.plan.states[1:]
         gradients = np.broadcast_to(E, (len(states), *E.shape[1:]))
@@ -189,7 +182,7 @@ class LocalProblem(NamedTuple):
         if len(D):
             values = values + np.einsum("krj,kj->kr", D, self.plan.inputs)
         outside = np.maximum(values - upper, lower - values)
-        return np.maximum(0.0, outside)[:, chosen]
+        return np.maximum(0.0, outside)
 
 
 class PredictionModel:
@@ -286,7 +279,8 @@ class PredictionModel:
 
     def misses_hard_rows(self, local: LocalProblem, limit: float) -> bool:
         """Returns whether a plan misses a hard row of the states by more than that."""
-        missed = local.row_violations(np.isinf(self.constraints.prices))
+        hard = np.isinf(self.constraints.prices)
+        missed = local.row_violations()[:, hard]
         return not missed.max(initial=0.0) <= limit
 
     def linearize_many(

@@ -50,7 +50,12 @@ from gpmpc.mpc._controller import (
     read_parameters,
 )
 from gpmpc.mpc._cost import FunctionNotFinite
-from gpmpc.mpc._elastic import NO_PRICE, TRIALS, elastic_limits
+from gpmpc.mpc._elastic import (
+    NO_PRICE,
+    TRIALS,
+    are_kept_again,
+    elastic_limits,
+)
 from gpmpc.mpc._guess import (
     initial_guess,
     is_contradicted,
@@ -646,9 +651,12 @@ class _ControlStep:
             constraints.any_elastic and self._row_prices is constraints.prices
         )
         if self._price_is_due and may_give_way and solution.status.solved:
-            planned = self._planned(program, solution, local)
-            if planned.row_violations(constraints.elastic).max() > KEPT:
-                solution = self._solve_elastic(program, solution, local)
+            violations = self._planned(program, solution, local).row_violations()
+            gives_way = constraints.elastic & (violations.max(axis=0) > KEPT)
+            if gives_way.any():
+                solution = self._solve_elastic(
+                    program, solution, local, gives_way, violations
+                )
                 self._globalization = None  # it weighs by the price before
         self._price_is_due = False
         self._programs += 1
@@ -686,21 +694,26 @@ class _ControlStep:
         return solver.solve(problem, warm_start)
 
     def _solve_elastic(
-        self, program: CondensedProgram, solution: QPSolution, local: LocalProblem
+        self,
+        program: CondensedProgram,
+        solution: QPSolution,
+        local: LocalProblem,
+        gives_way: Array,
+        violations: Array,
     ) -> QPSolution:
         """Returns the solution under the price that elastic rows are worth.
 
         Args:
             program: The program.
-            solution: Its solution under the exact price, which misses elastic rows.
+            solution: Its solution under the exact price.
             local: The problem of the program.
+            gives_way: The elastic rows that this solution misses (r,).
+            violations: By how much it misses all rows (H, r).
         """
         references = self._request.references
-        elastic = self._prediction.constraints.elastic
-        prices = self._prediction.constraints.prices.copy()
-        exact_price = float(prices[elastic].max())
-        prices[elastic] = NO_PRICE
-        free_solution = self._solve_priced(program, solution, prices)
+        exact_price = float(self._prediction.constraints.prices[gives_way].max())
+        no_prices = self._lowered_prices(gives_way, NO_PRICE)
+        free_solution = self._solve_priced(program, solution, no_prices)
         if not free_solution.status.solved:
             return solution
         free = self._planned(program, free_solution, local)
@@ -708,7 +721,8 @@ class _ControlStep:
             free,
             free_cost=float(free.stage_costs(references).sum()),
             guess_cost=float(local.stage_costs(references).sum()),
-            elastic=elastic,
+            rows=gives_way,
+            are_kept_again=are_kept_again(violations[:, gives_way]),
             Q=self._prediction.problem.cost.Q,
             largest_weight=exact_price / EXACT,
         )
@@ -718,49 +732,70 @@ class _ControlStep:
             affordable_cost = free_cost + limits.extra_cost
             if math.isfinite(affordable_cost):
                 return self._raise_elastic_price(
-                    program, solution, local, limits.least_price, affordable_cost
+                    program,
+                    solution,
+                    local,
+                    gives_way,
+                    limits.lowest_price,
+                    affordable_cost,
                 )
-        prices[elastic] = min(limits.least_price, exact_price)
-        self._row_prices = prices
-        return self._solve_priced(program, solution, prices)
+        prices = self._lowered_prices(gives_way, limits.least_price)
+        return self._solve_cheaper(program, solution, prices)
 
     def _raise_elastic_price(
         self,
         program: CondensedProgram,
         solution: QPSolution,
         local: LocalProblem,
-        least_price: float,
+        gives_way: Array,
+        lowest_price: float,
         affordable_cost: float,
     ) -> QPSolution:
         """Returns the solution under the highest price whose plan is affordable.
 
-        It is the exact price, or the highest of a few between the least and that, and
-        the least one where none of them is.
+        It is the exact price, or the highest of a few between the lowest and that, and
+        the lowest where none of them is.
         """
         if self._cost_when_followed(program, solution, local) <= affordable_cost:
             return solution
-        elastic = self._prediction.constraints.elastic
-        prices = self._prediction.constraints.prices.copy()
-        highest_price = float(prices[elastic].max())
-        price = min(least_price, highest_price)
+        highest_price = float(self._prediction.constraints.prices[gives_way].max())
+        price = min(lowest_price, highest_price)
         best = None
         for _ in range(TRIALS):
             if self._controller.is_late(self._stopwatch):
                 break
-            middle = math.sqrt(price * highest_price)
-            prices[elastic] = middle
+            trial_price = math.sqrt(price * highest_price)
+            prices = self._lowered_prices(gives_way, trial_price)
             trial = self._solve_priced(program, best or solution, prices)
             cost = self._cost_when_followed(program, trial, local)
             if trial.status.solved and cost <= affordable_cost:
-                price = middle
+                price = trial_price
                 best = trial
             else:
-                highest_price = middle
-        prices[elastic] = price
-        self._row_prices = prices
+                highest_price = trial_price
+        prices = self._lowered_prices(gives_way, price)
         if best is None:
-            return self._solve_priced(program, solution, prices)
+            return self._solve_cheaper(program, solution, prices)
+        self._row_prices = prices
         return best
+
+    def _lowered_prices(self, gives_way: Array, price: float) -> Array:
+        """Returns prices (r,) of which some rows have a lower one than the exact."""
+        exact_prices = self._prediction.constraints.prices
+        return np.where(gives_way, np.minimum(price, exact_prices), exact_prices)
+
+    def _solve_cheaper(
+        self, program: CondensedProgram, solution: QPSolution, prices: Array
+    ) -> QPSolution:
+        """Returns the solution under lower prices, which later programs keep.
+
+        Where that is not solved, the solution under the exact ones stays.
+        """
+        cheaper = self._solve_priced(program, solution, prices)
+        if not cheaper.status.solved:
+            return solution
+        self._row_prices = prices
+        return cheaper
 
     def _cost_when_followed(
         self, program: CondensedProgram, solution: QPSolution, local: LocalProblem

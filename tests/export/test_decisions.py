@@ -141,6 +141,18 @@ def obstacle(penalty="elastic"):
     return gpmpc(Problem(WEIGHTS, TORQUES, constraints=[box, apart], outputs=[output]))
 
 
+def narrow_lane():
+    """A lane narrower than its tubes in the end, a bound of the input, one to keep."""
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u")
+    push = Inequality(casadi.Function("h", [x, u], [u + 0.1 * x[1] - 0.3]))
+    lane = Box([-0.6, -np.inf], [0.6, np.inf], kappa=20.0)
+    fast = Box([-np.inf, -2.0], [np.inf, 2.0])
+    problem = Problem(WEIGHTS, TORQUES, constraints=[lane, push, fast])
+    noisy = Linearization(process_noise=True)
+    return gpmpc(problem, horizon=12, propagator=noisy, feedback=False)
+
+
 CONTROLLERS = {
     "inputs": lambda: gpmpc(Problem(Tracking([1.0, 0.1], [0.05], penalized="inputs"))),
     "deviations": lambda: gpmpc(
@@ -149,6 +161,7 @@ CONTROLLERS = {
     "elastic tube": lambda: tube("elastic"),
     "exact tube": lambda: tube("exact"),
     "hard tube": lambda: tube(None, rolled_out=True),
+    "narrow lane": narrow_lane,
     "obstacle and energy": obstacle,
     "hard obstacle": lambda: obstacle(None),
     "velocity form": lambda: gpmpc(Problem(WEIGHTS, TORQUES), form="velocity"),

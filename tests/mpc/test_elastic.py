@@ -7,8 +7,18 @@ import torch
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import KnownModel
-from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    Inequality,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+)
 from gpmpc.propagation import Linearization
+from gpmpc.qp import DualActiveSet
+from gpmpc.qp import _record as layout
 from gpmpc.status import Status
 from tests.mpc.small_models import LinearGaussian
 
@@ -165,3 +175,114 @@ def test_a_vehicle_pushed_out_of_its_lane_returns_without_a_spin():
         ends[penalty] = worst
     assert ends["exact"] > 1.0
     assert ends["default"] < 1.1 * max(0.2, ends["none"])
+
+
+def test_a_bound_that_can_be_kept_is_not_sold_with_one_that_cannot():
+    """Heat that takes long to leave, beside a wall that a slide need not cross."""
+    model = LinearGaussian(
+        [[0.99, 0.0], [0.0, 1.0]], [[0.01, 0.0], [0.0, 1.0]], c=[0.0, 0.0]
+    )
+    bounds = [
+        Box([-np.inf, -np.inf], [100.0, np.inf]),
+        Box([-np.inf, -np.inf], [np.inf, 1.0]),
+    ]
+    problem = Problem(
+        Tracking([1e-4, 1.0], [1e-3, 1e-3], penalized="inputs"),
+        Box([-1.0, -1.0], [1.0, 1.0]),
+        constraints=bounds,
+    )
+    prediction = PredictionSettings(covariance="none")
+    controller = GPMPC(model, Linearization(), problem, 20, [0.0, 0.0], prediction)
+    state = np.array([200.0, 0.0])
+    decision = None
+    for _ in range(3):
+        decision = controller.control(
+            Gaussian.certain(state), Reference(np.array([100.0, 2.0])), decision
+        )
+        assert decision.status is Status.SOFT_BOUND_MISSED
+        assert decision.means[1:, 1].max() <= 1.0 + 1e-7
+        state = decision.means[1]
+    assert state[1] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_bound_of_an_input_that_costs_nothing_counts():
+    """The plan without the bound rests at its reference, by an input beyond it."""
+    model = LinearGaussian([[0.9]], [[1.0]])
+    cost = Tracking([1.0], [0.1], penalized="increments")
+    problem = Problem(
+        cost,
+        Box([-2.0], [2.0]),
+        input_rates=Box([-0.1], [0.1]),
+        constraints=[Inequality(h=lambda x, u: u - 0.5, count=1)],
+    )
+    prediction = PredictionSettings(covariance="none")
+    controller = GPMPC(model, Linearization(), problem, H, [1.0], prediction)
+    belief = Gaussian.certain(np.array([10.0]))
+    decision = None
+    for _ in range(2):
+        decision = controller.control(belief, Reference(np.array([10.0])), decision)
+        assert decision.status is Status.SOFT_BOUND_MISSED
+        assert decision.inputs[-1, 0] < 0.8  # 1.0 without the bound
+
+
+def drift_out_of_a_lane(penalty, decisions):
+    """A plan of an unstable cart whose tubes become wider than its lane."""
+    model = LinearGaussian(
+        [[1.0, 0.1], [0.4, 1.05]], [[0.005], [0.1]], W=np.diag([1e-4, 4e-4]).tolist()
+    )
+    lane = Box([-0.1, -np.inf], [0.1, np.inf], probability=0.95, penalty=penalty)
+    problem = Problem(
+        Tracking([1.0, 0.1], [0.05], penalized="inputs"),
+        Box([-20.0], [20.0]),
+        constraints=[lane],
+    )
+    settings = PredictionSettings(covariance="zero_order", feedback=False)
+    controller = GPMPC(model, Linearization(), problem, 20, [0.0], settings)
+    belief = Gaussian.certain(np.array([0.0, 0.0]))
+    reference = Reference(np.array([0.3, 0.0]))
+    decision = None
+    for _ in range(decisions):
+        decision = controller.control(belief, reference, decision)
+    return decision
+
+
+def test_a_bound_that_is_lost_in_the_end_costs_a_tenth_at_most():
+    free = drift_out_of_a_lane(penalty=1e-9, decisions=2)
+    exact = drift_out_of_a_lane(penalty="exact", decisions=2)
+    assert exact.cost > 1.3 * free.cost
+    elastic = drift_out_of_a_lane(penalty="elastic", decisions=2)
+    assert elastic.status is Status.SOFT_BOUND_MISSED
+    assert 1.01 * free.cost < elastic.cost <= 1.1 * free.cost + 1e-9
+
+
+class StopsUnderLowPrices(DualActiveSet):
+    """Solves only what has no price, or the exact one."""
+
+    def solve(self, problem, warm_start=None, prices=None):
+        solution = super().solve(problem, warm_start, prices)
+        priced = prices[np.isfinite(prices)]
+        if ((priced > 1e-6) & (priced < 1e5)).any():
+            record = solution.record.copy()
+            record[layout.STATUS] = layout.STATUSES.index(Status.ITERATION_LIMIT)
+            solution = solution._replace(record=record)
+        return solution
+
+
+def test_a_solution_stays_where_the_one_of_a_lower_price_fails():
+    bound = Box([-np.inf, -np.inf], [0.5, np.inf])
+    problem = Problem(
+        Tracking([1.0, 0.1], [0.01], penalized="inputs"),
+        Box([-8.0], [8.0]),
+        constraints=[bound],
+    )
+    model = LinearGaussian([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]])
+    prediction = PredictionSettings(covariance="none")
+    controller = GPMPC(
+        model, Linearization(), problem, H, [0.0], prediction, StopsUnderLowPrices()
+    )
+    decision = controller.control(
+        Gaussian.certain(np.array([2.0, 0.0])), Reference(np.zeros(2))
+    )
+    assert decision.status is Status.SOFT_BOUND_MISSED
+    exact = planned("exact", [2.0, 0.0], push=8.0)
+    np.testing.assert_allclose(decision.inputs, exact.inputs, atol=1e-7)
