@@ -35,9 +35,13 @@ _MOST = 9.0  # of the mean squared error: variance that is claimed at most
 _LEAST_FREEDOM = 4.0  # independent errors that a variance is supposed to be of
 _CUTS = 8  # rounds in which what is cut off is made up for
 _NOTHING = 1e-300  # least variance that anything is divided by
-# Both are multiples of the time T of the longest prediction.
-_FORGETTING = 6.0  # time constant with which the weight of an earlier error decays
-_PRIOR = 1.0  # weight of the claim itself, as an error that is as large as claimed
+#: time constant with which the weight of an earlier error decays, in multiples of the
+#: time of the longest prediction
+_FORGETTING = 6.0
+#: weight of the claim itself, as of errors that are as large as claimed: this share of
+#: the rows of a prediction,
+_PRIOR = 0.5
+_LEAST_PRIOR = 20  # or so many rows
 
 
 def error_variances(
@@ -68,10 +72,12 @@ def follow_errors(
     A run may be calmer or rougher than those that the noise was fitted to. For each
     entry of the state and each step the scale is the mean of squared errors over
     claimed variances of the predictions that were over before, weighted by exp(-age /
-    (6 T)) and by the claimed deviations, with a one of the weight T added, and T the
-    time of the longest prediction (adaptive conformal inference by variances instead of
-    quantiles; Gibbs and Candes, 2021). Without the deviations, moments where little was
-    claimed would decide; with the variances, only those where much was.
+    (6 T)), with T the time of the longest prediction, and by the claimed deviations
+    (adaptive conformal inference by variances instead of quantiles; Gibbs and Candes,
+    2021). Without the deviations, moments where little was claimed would decide; with
+    the variances, only those where much was. A one is added with the weight of half a
+    prediction's rows, 20 at least: errors k steps ahead are alike over k rows, and a
+    run shows soon how large those one step ahead are.
 
     Args:
         windows: W of them.
@@ -83,13 +89,13 @@ def follow_errors(
         The scaled variances (W, steps, e).
     """
     longest = max(steps) * windows.time_step
-    prior = _PRIOR * longest
     scaled = variances.copy()
     for run in np.unique(windows.runs):
         rows = np.flatnonzero(windows.runs == run)
         times = windows.times[rows]
         spacing = float(times[-1] - times[0]) / max(len(rows) - 1, 1)
         for k, step in enumerate(steps):
+            prior = max(_PRIOR * step, _LEAST_PRIOR) * windows.time_step
             # A prediction that is just over has the age of half a step.
             age = times[:, None] - times - (step - 0.5) * windows.time_step
             decay = np.exp(-np.maximum(age, 0) / (_FORGETTING * longest))

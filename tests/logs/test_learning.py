@@ -376,6 +376,20 @@ def test_intervals_follow_a_rougher_run_and_never_its_future(flights):
     )
 
 
+def test_a_calm_run_is_soon_known_one_step_ahead(flights):
+    """Errors one step ahead are many where those of fifty steps are one."""
+    windows = as_log(flights[:1]).windows(50, 20)
+    errors = np.full((len(windows), 2, 12), 0.1)
+    claimed = np.ones_like(errors)
+    scaled = follow_errors(windows, errors, claimed, (1, 50))
+    row = 61  # 61 predictions of one step are over, and twelve of fifty
+    forgotten = np.exp(-np.arange(61.0) / 300)
+    near = 1 - 0.99 * forgotten.sum() / (20 + forgotten.sum())
+    far = 1 - 0.99 * forgotten[:12].sum() / (25 + forgotten[:12].sum())
+    np.testing.assert_allclose(scaled[row, 0], near, rtol=0.02)
+    np.testing.assert_allclose(scaled[row, 1], far, rtol=0.02)
+
+
 def test_intervals_are_as_wide_as_errors_where_claims_go_astray(flights):
     windows = as_log(flights[:1]).windows(20, 20, 2)
     rng = np.random.default_rng(0)
