@@ -177,12 +177,11 @@ def outcome_of_inputs(
     prices = prediction.constraints.prices
     hard = np.isinf(prices)
     soft = ~hard & ~prediction.constraints.elastic
-    soft_misses = (led.row_violations(soft) - KEPT).clip(0.0)
-    hard_misses = (led.row_violations(hard) - KEPT).clip(0.0)
+    misses = (led.row_violations() - KEPT).clip(0.0)
     return Outcome(
         cost=float(stage_costs.sum()),
-        soft_price=float((soft_misses @ prices[soft]).sum()),
-        hard_miss=float(hard_misses.max(initial=0.0)),
+        soft_price=float((misses[:, soft] @ prices[soft]).sum()),
+        hard_miss=float(misses[:, hard].max(initial=0.0)),
     )
 
 
