@@ -208,6 +208,7 @@ def _rows_of(
     if covariance != "none":
         sides = int(np.isfinite(lower).sum() + np.isfinite(upper).sum())
         kappa = constraint.standard_deviations(sides)
+    prices = problem.prices(constraint, F)
     if isinstance(constraint, Inequality):
         F = np.zeros((r, problem.state_dim))
     return _Rows(
@@ -215,7 +216,7 @@ def _rows_of(
         lower=lower,
         upper=upper,
         kappa=np.full(r, kappa),
-        prices=np.full(r, problem.price(constraint)),
+        prices=prices,
         elastic=np.full(r, constraint.penalty == "elastic"),
     )
 

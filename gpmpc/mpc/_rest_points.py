@@ -15,6 +15,7 @@ from gpmpc.mpc._controller import Reference, read_parameters
 from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._linear_quadratic import DEVIATIONS, INCREMENTS, Plan, QuadraticCost
 from gpmpc.mpc._linearization import PredictionModel
+from gpmpc.mpc._novelty import data_scales
 
 Array = np.ndarray
 
@@ -22,7 +23,7 @@ _POINTS = 10  # of a trajectory
 _ITERATIONS = 20  # towards a point of rest
 _HALVINGS = 10  # of a step that does not improve
 _ROUNDING = 1e-6  # relative rise of a value that counts as none
-_SETTLED = 1e-3  # last change of a point of rest, relative to its size or 1
+_SETTLED = 1e-3  # last change of a point of rest, relative to its size
 _AT_REST = 1e-2  # largest step of a state at rest, likewise: learned models drift
 _NEGLIGIBLE = 1e-3  # weight of what no cost weighs, in the largest one
 _PRICE = 1e3  # of a state that does not rest, in the largest weight
@@ -150,6 +151,7 @@ class _RestSearch:
         pending = pending_inputs(prediction.model)
         state[pending] = np.tile(input, len(pending) // len(input))
         current = self._at(state, input)
+        least_sizes = self._least_sizes(current)
         for _ in range(_ITERATIONS):
             if not math.isfinite(current.value):
                 return None
@@ -163,15 +165,35 @@ class _RestSearch:
             state = state + change[:n]
             input = input + change[n:]
             current = candidate
-            sizes = np.maximum(1.0, np.abs(np.concatenate([state, input])))
+            sizes = np.maximum(least_sizes, np.abs(np.concatenate([state, input])))
             if (np.abs(change) <= _SETTLED * sizes).all():
                 break
         lower, upper = prediction.problem.inputs.first
         within = (lower < input) & (input < upper)
-        rests = np.abs(current.defect) <= _AT_REST * np.maximum(1.0, np.abs(state))
+        state_sizes = np.maximum(least_sizes[:n], np.abs(state))
+        rests = np.abs(current.defect) <= _AT_REST * state_sizes
         if not (within.all() and rests.all()):
             return None
         return RestPoint(state, input, A=current.A, B=current.B, cost=current.cost)
+
+    def _least_sizes(self, start: _Unrest) -> Array:
+        """Returns sizes (n + m,) that states and inputs near zero have all the same.
+
+        They are 1, or what is less of their ranges: of a state in the model's data, or
+        as far as the inputs move it within a horizon; of an input between its bounds.
+        """
+        prediction = self._prediction
+        lower, upper = prediction.problem.inputs.first
+        input_ranges = upper - lower
+        if np.isfinite(input_ranges).all():
+            state_ranges = _reach(start.A, start.B, input_ranges, prediction.horizon)
+        else:
+            state_ranges = np.ones(len(start.A))
+        scales = data_scales(prediction.model)
+        if scales is not None:
+            has_range = np.isfinite(scales.ranges)
+            state_ranges = np.where(has_range, scales.ranges, state_ranges)
+        return np.minimum(1.0, np.concatenate([state_ranges, input_ranges]))
 
     def _at(self, state: Array, input: Array) -> _Unrest:
         """Returns cost and defect at a state (n,) and an input (m,)."""
@@ -216,6 +238,18 @@ class _RestSearch:
             gradient=gradient,
             value=value,
         )
+
+
+def _reach(A: Array, B: Array, input_ranges: Array, horizon: int) -> Array:
+    """Returns how far inputs within their ranges (m,) move states (n,), 1 at most."""
+    effect = B
+    reach = np.abs(effect) @ input_ranges
+    for _ in range(horizon - 1):
+        if (reach >= 1.0).all():
+            break
+        effect = A @ effect
+        reach = np.minimum(1.0, reach + np.abs(effect) @ input_ranges)
+    return reach
 
 
 def _cost_at(

@@ -15,8 +15,10 @@ g'mu + kappa sqrt(g'Sigma g) <= f, kappa = Phi^-1(eta); smooth ones, h(x, u, p) 
 are linearised along the plan. By default a constraint is soft: a violation pays a
 price, so that a program always has a solution. The penalty is exact (Fletcher, 1987,
 section 14.3): as long as the price exceeds what the cost can gain by a violation, no
-plan that can keep the constraint pays it. Where it cannot be kept, an elastic one gives
-way: its price falls to what cannot outweigh the cost (``gpmpc.mpc._elastic``).
+plan that can keep the constraint pays it. It is 1e6 largest weights per distance by
+which a state is beyond the bound; multipliers are twice a weight times how far the cost
+would go beyond it. Where it cannot be kept, an elastic one gives way: its price falls
+to what cannot outweigh the cost (``gpmpc.mpc._elastic``).
 """
 
 import math
@@ -44,8 +46,8 @@ from gpmpc.qp._problem import ABSENT
 
 Array = np.ndarray
 
-# The exact price, in the cost's largest weight: more than any multiplier that a
-# bound is worth.
+# The exact price of a distance of 1, in the cost's largest weight: more than the
+# multiplier of any bound that is less than half of this from what the cost asks for.
 EXACT = 1e6
 
 
@@ -73,9 +75,11 @@ class Constraint:
     #: paper takes 2 for 0.95)
     kappa: float | None = None
     #: price of a violation per unit and stage; ``"exact"``: one that no plan pays which
-    #: can keep the constraint; ``"elastic"``: the exact one, and where the constraint
-    #: cannot be kept one for which the plan costs at most five times what it costs
-    #: without (``gpmpc.mpc._elastic``); None: hard
+    #: can keep the constraint, unless the cost asks for states some 1e5 units beyond
+    #: it; slopes of ``Inequality`` and ``LeastSquares`` are to be near 1;
+    #: ``"elastic"``: the exact one, and where the constraint cannot be kept one for
+    #: which the plan costs at most five times what it costs without
+    #: (``gpmpc.mpc._elastic``); None: hard
     penalty: float | Literal["elastic", "exact"] | None = "elastic"
     #: those of 1 .. H that it holds at, such as ``range(5, 11)``; all by default
     stages: Iterable[int] | None = None
@@ -482,13 +486,32 @@ class Problem:
             rule = f"{error}, where the flight starts"
             raise SettingError("controller.problem", rule) from None
 
-    def price(self, constraint: Constraint) -> float:
-        """Returns the price of violating a constraint, infinite for a hard one."""
-        if constraint.penalty is None:
-            return math.inf
-        if constraint.penalty not in ("elastic", "exact"):
-            return float(constraint.penalty)
+    @cached_property
+    def largest_weight(self) -> float:
+        """The largest eigenvalue of a weight of the cost."""
         cost = self.cost
         weights = [cost.Q, cost.terminal, cost.R]
         weights += [output.weight for output in self.outputs]
-        return EXACT * float(max(np.linalg.eigvalsh(W).max() for W in weights))
+        return float(max(np.linalg.eigvalsh(W).max() for W in weights))
+
+    def prices(self, constraint: Constraint, F: Array) -> Array:
+        """Returns the prices of violating the rows of a constraint (r,).
+
+        They are infinite for a hard one. An exact price is one of the distance by which
+        a state is beyond the bound: a row with a gradient of another length than 1 has
+        another one per unit, so that rows may be scaled.
+
+        Args:
+            constraint: One of the problem.
+            F: Its rows (r, n); without columns where gradients are not known before
+                there is a plan, which count as 1.
+        """
+        rows = len(F)
+        if constraint.penalty is None:
+            return np.full(rows, math.inf)
+        if constraint.penalty not in ("elastic", "exact"):
+            return np.full(rows, float(constraint.penalty))
+        lengths = np.ones(rows)
+        if F.shape[1] > 0:
+            lengths = np.linalg.norm(F, axis=1)
+        return EXACT * self.largest_weight / lengths

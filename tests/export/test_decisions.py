@@ -118,9 +118,11 @@ def by_stage():
     return gpmpc(Problem(cost, inputs, constraints=[rows]), rolled_out=True)
 
 
-def tube(penalty, **prediction):
+def tube(penalty, unit=1.0, **prediction):
     """A plane that is kept with 90 %, under rates and process noise."""
-    plane = Halfspaces([[1.0, 0.2]], [0.3], probability=0.9, penalty=penalty)
+    plane = Halfspaces(
+        [[unit, 0.2 * unit]], [0.3 * unit], probability=0.9, penalty=penalty
+    )
     problem = Problem(
         WEIGHTS, TORQUES, input_rates=Box([-0.8], [0.8]), constraints=[plane]
     )
@@ -160,6 +162,8 @@ CONTROLLERS = {
     ),
     "elastic tube": lambda: tube("elastic"),
     "exact tube": lambda: tube("exact"),
+    "elastic tube in a large unit": lambda: tube("elastic", unit=1e-3),
+    "exact tube in a large unit": lambda: tube("exact", unit=1e-3),
     "hard tube": lambda: tube(None, rolled_out=True),
     "narrow lane": narrow_lane,
     "obstacle and energy": obstacle,

@@ -10,6 +10,7 @@ from gpmpc.models import KnownModel
 from gpmpc.mpc import (
     GPMPC,
     Box,
+    Halfspaces,
     Inequality,
     PredictionSettings,
     Problem,
@@ -55,6 +56,20 @@ def test_an_elastic_bound_is_exact_where_it_can_be_kept(start):
     assert elastic.status is Status.SOLVED
     assert elastic.means[1:, 0].max() <= 0.5 + 1e-7
     np.testing.assert_allclose(elastic.inputs, exact.inputs, atol=1e-7)
+
+
+@pytest.mark.parametrize("penalty", ["elastic", "exact"])
+@pytest.mark.parametrize("length", [1e-6, 1e-3, 1.0, 1e3])
+def test_a_bound_that_can_be_kept_is_kept_however_its_row_is_scaled(penalty, length):
+    """A pressure of half a megapascal, in pascals, and its row as large as one."""
+    model = KnownModel(lambda x, u: x + u, 1, 1)
+    row = Halfspaces([[length]], [length * 5e5], penalty=penalty)
+    problem = Problem(Tracking([1.0], [1e-3], penalized="inputs"), constraints=[row])
+    settings = PredictionSettings(covariance="none")
+    controller = GPMPC(model, Linearization(), problem, 10, [0.0], settings)
+    plan = controller.control(Gaussian.certain([0.0]), Reference(np.array([6e5])))
+    assert plan.status is Status.SOLVED
+    assert plan.means[1:, 0] == pytest.approx(np.full(10, 5e5), rel=1e-9)
 
 
 @pytest.mark.parametrize("form", ["trajectory", "velocity"])

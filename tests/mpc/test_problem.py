@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import SettingError
-from gpmpc.mpc import Box, Halfspaces, Problem, Tracking
+from gpmpc.mpc import Box, Halfspaces, Inequality, Problem, Tracking
 
 
 def test_diagonals_and_matrices_mean_the_same():
@@ -124,9 +124,23 @@ def test_kappa_is_the_quantile_of_the_probability_unless_given():
 
 def test_the_penalty_is_infinite_as_given_or_above_any_weight():
     problem = Problem(Tracking([1.0, 200.0], [3.0]))
-    assert problem.price(Box([0.0] * 2, penalty=None)) == math.inf
-    assert problem.price(Box([0.0] * 2, penalty=7.0)) == 7.0
-    assert problem.price(Box([0.0] * 2)) >= 1e4 * 200.0
+    units = np.eye(2)
+    assert (problem.prices(Box([0.0] * 2, penalty=None), units) == math.inf).all()
+    assert (problem.prices(Box([0.0] * 2, penalty=7.0), units) == 7.0).all()
+    assert (problem.prices(Box([0.0] * 2), units) == 1e6 * 200.0).all()
+
+
+def test_an_exact_price_is_one_of_a_distance_however_rows_are_scaled():
+    problem = Problem(Tracking([1.0, 200.0], [3.0]))
+    F = np.array([[3e-6, 4e-6], [0.0, -1e3]])
+    for penalty in ("elastic", "exact"):
+        planes = Halfspaces(F, [1.0, 1.0], penalty=penalty)
+        prices = problem.prices(planes, planes.F)
+        assert prices == pytest.approx([1e6 * 200.0 / 5e-6, 1e6 * 200.0 / 1e3])
+    declared = Halfspaces(F, [1.0, 1.0], penalty=7.0)
+    assert (problem.prices(declared, declared.F) == 7.0).all()
+    disc = Inequality(lambda x: 1.0 - x[:, :1], penalty="exact")
+    assert (problem.prices(disc, disc.rows(5).F) == 1e6 * 200.0).all()
 
 
 @pytest.mark.parametrize(

@@ -323,3 +323,22 @@ def test_a_plant_or_a_delay_of_something_else_is_refused():
         controller.stability(goal, ahead=INTEGRATOR)
     with pytest.raises(SettingError, match=r"ahead.*4 states"):
         controller.stability(goal, ahead=DelayedModel(INTEGRATOR, 2))
+
+
+@pytest.mark.parametrize("creep", [0.0, 0.1])
+@pytest.mark.parametrize("micrometre", [1e-6, 1.0])
+def test_what_moves_on_is_no_rest_in_any_unit(micrometre, creep):
+    """A stage that an input moves by a micrometre a step, and a load that creeps.
+
+    In metres its steps are none beside 1.
+    """
+
+    def next_state(x, u):
+        position, load = x.unbind(-1)
+        position = position + micrometre * u[..., 0]
+        return torch.stack([position, load + creep * micrometre], dim=-1)
+
+    model = KnownModel(next_state, 2, 1)
+    cost = Tracking([1.0 / micrometre**2, 0.0], [1.0])
+    controller = loop_of(model, cost, 10, [0.0], bounds=Box([-1.0], [1.0]))
+    assert controller.stability(np.zeros(2)).judged == (creep == 0.0)
