@@ -33,6 +33,7 @@ _COMMENTS = {
     "GPMPC_GP_OUTPUTS": "k",
     "GPMPC_PENALIZED": "what R weighs: 0 inputs, 1 deviations, 2 increments",
     "GPMPC_TOLERANCE": "of a solution, as a share of its size",
+    "GPMPC_LARGEST_WEIGHT": "of the cost",
     "GPMPC_DISTURBANCE_GAIN": "of the estimate of a constant error",
     "GPMPC_STATE_WEIGHTS": "weights Q: one, or one for each stage",
     "GPMPC_INPUT_WEIGHTS": "weights R, likewise",
@@ -131,6 +132,7 @@ def definitions(
         "GPMPC_COST_ANGLE_COUNT": str(len(angles)),
         "GPMPC_STATE_ANGLE_COUNT": str(len(prediction.angles)),
         "GPMPC_TOLERANCE": f"(gpmpc_real){tolerance!r}",
+        "GPMPC_LARGEST_WEIGHT": f"(gpmpc_real){controller.problem.largest_weight!r}",
         "GPMPC_DISTURBANCE_GAIN": f"(gpmpc_real){float(gain)!r}",
     }
     values |= {f"GPMPC_{name}": str(size) for name, size in model_sizes.items()}

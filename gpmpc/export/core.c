@@ -1284,7 +1284,7 @@ typedef struct {
    where they are kept again, else lower prices are tried, too, for J0 / 10. */
 static elastic_limits limits_of_price(const gpmpc_problem *problem, const real *misses,
                                       const int *gives_way, int kept_again,
-                                      real free_cost, real guess_cost, real exact_price)
+                                      real free_cost, real guess_cost)
 {
     elastic_limits limits;
     real cost = smaller(larger(free_cost, guess_cost), 2 * free_cost);
@@ -1307,7 +1307,7 @@ static elastic_limits limits_of_price(const gpmpc_problem *problem, const real *
                 largest = larger(largest, Q[i * n + i]);
             }
             if (!(largest > 0))
-                largest = exact_price / REAL(1e6);
+                largest = GPMPC_LARGEST_WEIGHT;
             square = dot(g, g, n);
             /* counts where the cost does not weigh the direction */
             if (!(weight > REAL(1e-12) * largest * square))
@@ -1451,8 +1451,7 @@ static void solve_elastic(gpmpc_controller *controller)
     expand(problem, without->x, inputs, states);
     write_misses(problem, without, misses);
     limits = limits_of_price(problem, misses, gives_way, kept_again,
-                             cost_of_plan(problem, states, inputs), guess_cost,
-                             highest);
+                             cost_of_plan(problem, states, inputs), guess_cost);
     if (!problem->has_feedback)
         write_gains(problem);
     affordable_cost = INFINITY;

@@ -79,7 +79,7 @@ from gpmpc.mpc._roll_out import (
 )
 from gpmpc.mpc._sqp import FAILURES, Globalization, Iterate, measure_continuity
 from gpmpc.mpc._stability import Stability, stability
-from gpmpc.mpc.problem import EXACT, Problem
+from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Propagator
 from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
 from gpmpc.signals import Signals
@@ -711,7 +711,6 @@ class _ControlStep:
             violations: By how much it misses all rows (H, r).
         """
         references = self._request.references
-        exact_price = float(self._prediction.constraints.prices[gives_way].max())
         no_prices = self._lowered_prices(gives_way, NO_PRICE)
         free_solution = self._solve_priced(program, solution, no_prices)
         if not free_solution.status.solved:
@@ -724,7 +723,7 @@ class _ControlStep:
             rows=gives_way,
             are_kept_again=are_kept_again(violations[:, gives_way]),
             Q=self._prediction.problem.cost.Q,
-            largest_weight=exact_price / EXACT,
+            largest_weight=self._prediction.problem.largest_weight,
         )
         is_first = self._programs == 0
         if is_first and self._request.previous is not None:

@@ -129,6 +129,15 @@ def tube(penalty, unit=1.0, **prediction):
     return gpmpc(problem, **prediction)
 
 
+def unweighed(unit):
+    """A bound of states that nothing weighs but their energy, which gives way."""
+    rail = Halfspaces([[unit, 0.0]], [0.05 * unit])
+    x = casadi.SX.sym("x", 2)
+    energy = LeastSquares(casadi.Function("y", [x], [casadi.sin(x[0])]), [0.3])
+    cost = Tracking([0.0, 0.0], [0.05], penalized="inputs")
+    return gpmpc(Problem(cost, TORQUES, constraints=[rail], outputs=[energy]))
+
+
 def obstacle(penalty="elastic"):
     """A disc that moves in the plane of the states, and a cost of energy, in CasADi."""
     x = casadi.SX.sym("x", 2)
@@ -166,6 +175,7 @@ CONTROLLERS = {
     "exact tube in a large unit": lambda: tube("exact", unit=1e-3),
     "hard tube": lambda: tube(None, rolled_out=True),
     "narrow lane": narrow_lane,
+    "states that nothing weighs, in a large unit": lambda: unweighed(2.0**-10),
     "obstacle and energy": obstacle,
     "hard obstacle": lambda: obstacle(None),
     "velocity form": lambda: gpmpc(Problem(WEIGHTS, TORQUES), form="velocity"),

@@ -12,6 +12,7 @@ from gpmpc.mpc import (
     Box,
     Halfspaces,
     Inequality,
+    LeastSquares,
     PredictionSettings,
     Problem,
     Reference,
@@ -70,6 +71,32 @@ def test_a_bound_that_can_be_kept_is_kept_however_its_row_is_scaled(penalty, len
     plan = controller.control(Gaussian.certain([0.0]), Reference(np.array([6e5])))
     assert plan.status is Status.SOLVED
     assert plan.means[1:, 0] == pytest.approx(np.full(10, 5e5), rel=1e-9)
+
+
+@pytest.mark.parametrize("weights", [[1.0, 0.1], [0.0, 0.0]])
+def test_what_gives_way_does_so_however_its_row_is_scaled(weights):
+    """By sixteen, which leaves the digits of a price as they are."""
+    model = LinearGaussian([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]])
+    settings = PredictionSettings(covariance="none")
+    speed = LeastSquares(lambda x: x[:, 1:], [0.1])
+    plans = []
+    for unit in (1.0, 1 / 16, 16.0):
+        lane = Halfspaces([[unit, 0.0]], [0.5 * unit])
+        problem = Problem(
+            Tracking(weights, [0.01], penalized="inputs"),
+            Box([-50.0], [50.0]),
+            constraints=[lane],
+            outputs=[speed],
+        )
+        controller = GPMPC(model, Linearization(), problem, H, [0.0], settings)
+        plan = controller.control(
+            Gaussian.certain(np.array([0.8, 1.0])), Reference(np.zeros(2))
+        )
+        assert plan.status is Status.SOFT_BOUND_MISSED
+        plans.append(plan.inputs)
+    assert np.abs(plans[0]).max() < 40.0  # gives way
+    np.testing.assert_allclose(plans[1], plans[0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(plans[2], plans[0], rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("form", ["trajectory", "velocity"])
