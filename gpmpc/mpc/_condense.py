@@ -22,8 +22,9 @@ has, and its smallest eigenvalue, of the size of R, is lost. There the unknowns 
 is added to the optimal unbounded feedback, u_k = F_k [s_k; u_{k-1}; 1] + v_k, by the
 Riccati recursion: P is block diagonal, q is zero, and the response to v is stable. The
 bounds of inputs are rows, for which stable plants would pay two to three times the
-time. So these coordinates are used where the diagonal of P exceeds that of the last
-stage, which no A enters, by ``_LARGEST_GROWTH``.
+time. So these coordinates are used where the entries of the diagonal of P, each over
+that of the last stage, which no A enters, sum up to more than ``_LARGEST_GROWTH``.
+Weights by stage that are much smaller at the end count as growth, too.
 """
 
 import numpy as np

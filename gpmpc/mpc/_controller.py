@@ -203,8 +203,8 @@ class Decision:
     #: of these (H + 1, n, n); zero where the controller does not predict them
     covariances: Array
     status: Status  #: how the solve ended
-    #: of the solver; of ``GPMPC`` its quadratic programs, of ``LQR`` the horizon, its
-    #: Riccati steps
+    #: of the solver; of ``GPMPC`` its quadratic programs, those for the price of an
+    #: elastic bound counted once, of ``LQR`` the horizon, its Riccati steps
     iterations: int
     timing: Timing  #: of the parts
     #: that was solved last, where there is one
@@ -228,7 +228,9 @@ class Decision:
     #: taken at its means; soft ones may be missed. Zero but for rounding where all are
     #: kept; NaN where that is not known
     violation: float = math.nan
-    #: lengths of the steps that its programs took, squared in the metric of the cost
+    #: lengths of the steps that its programs took, squared in the metric of the cost:
+    #: by them the next decision tells a jump. Empty after a first plan of one program
+    #: and along a flight of ``ManyStarts``: then the next one takes one program
     steps: tuple[float, ...] = ()
     #: ``novelty``; or a function where no variances were computed, which is called when
     #: ``novelty`` is read

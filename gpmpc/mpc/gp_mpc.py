@@ -138,9 +138,10 @@ class GPMPC:
         prediction: Form, covariance mode, feedback and disturbance estimate.
         solver: Of the quadratic program; ``DualActiveSet()`` by default, which soft
             constraints need.
-        iterations: Quadratic programs a step at most; more than one for the form
-            ``"trajectory"`` only. By default as many as a step needs: one where the
-            last plan goes on, more after a jump or a disturbance.
+        iterations: Quadratic programs a step at most, but for those that only look for
+            the price of an elastic bound; more than one for the form ``"trajectory"``
+            only. By default as many as a step needs: one where the last plan goes on,
+            more after a jump or a disturbance.
         tolerance: Of more iterations: relative offset and defects of a plan that counts
             as solved (``gpmpc.mpc._sqp``), estimated from the slower of the last two
             rates of convergence. 1e-8 may be out of reach. By default 1e-2 where the
@@ -148,8 +149,9 @@ class GPMPC:
             along the last plan by one program is not measured by it: it is solved where
             its program is.
         budget: Time of a decision after which no further program is begun [s]: it then
-            ends with ``TIME_LIMIT``, unless it was solved. None for no limit. Decisions
-            then depend on the machine.
+            ends with ``TIME_LIMIT``, unless it was solved. The first program, and what
+            an elastic bound takes at least, are solved whatever it is. None for no
+            limit. Decisions then depend on the machine.
 
     Raises:
         SettingError: A setting is unknown or out of its range, or model and problem
@@ -236,9 +238,9 @@ class GPMPC:
         """Decides the input for one step; see ``Controller.control``.
 
         A belief that is not finite gives ``INVALID_MEASUREMENT``. ``iterations`` of the
-        decision counts quadratic programs; ``ITERATION_LIMIT``, or ``TIME_LIMIT`` where
-        the budget was spent, says that the tolerance was not reached: the plan is the
-        best there was.
+        decision counts quadratic programs, those that look for the price of an elastic
+        bound as one; ``ITERATION_LIMIT``, or ``TIME_LIMIT`` where the budget was spent,
+        says that the tolerance was not reached: the plan is the best there was.
 
         Args:
             belief: What is known of the state.
