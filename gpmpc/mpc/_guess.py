@@ -71,12 +71,23 @@ def read_request(
         disturbance = _estimate_disturbance(prediction, request, previous)
         request = request._replace(disturbance=disturbance)
     if plan is not None and request.guessed_states is None:
-        states = prediction.lead(
-            request.state, request.guessed_inputs, request.disturbance
-        )
+        states = _states_of_guess(prediction, request)
         request = request._replace(guessed_states=states)
         request = _turned_towards(states, request, prediction)
     return request
+
+
+def _states_of_guess(prediction: PredictionModel, request: Request) -> Array:
+    """Returns the states (H + 1, n) that the guessed inputs lead to.
+
+    All of them are the first one where the model has no numbers.
+    """
+    try:
+        return prediction.lead(
+            request.state, request.guessed_inputs, request.disturbance
+        )
+    except FAILURES:
+        return np.tile(request.state, (prediction.horizon + 1, 1))
 
 
 def _turned_towards(

@@ -8,8 +8,8 @@ decision.
 
 To add a policy, such as one that holds the input for three steps and then follows an
 LQR: name it in ``OnFailure``, which ``check_policy`` and the settings of loops and
-studies read; choose its input in ``_conclude``, beside ``_continue_last_plan``, which
-also holds inputs for ``"hold"``; and tell of it in ``decide`` and ``ControlLoop``. A
+studies read; choose its input in ``_input_of_policy``, and what is applied between
+decisions in ``ControlLoop.input_between``; and tell of it in ``decide`` and there. A
 ``Command`` holds the last plan alone: what a policy counts or remembers is to be a
 field of it. A policy that asks another controller needs that beside the name; what is
 known of the state is ``situation.belief``.
@@ -470,7 +470,7 @@ def _conclude(
         decision = replace(decision, status=status, suboptimal=False) if fits else None
     if on_failure == "raise":
         raise SolverFailure(step, reason)
-    plan = _continue_last_plan(controller, last, on_failure)
+    plan = _plan_of_policy(controller, last, on_failure)
     if plan is None:
         plan = _plan_without_prediction(controller, reference, last, status)
     if plan is None:
@@ -507,25 +507,47 @@ def _learned_so_far(decision: Decision | None, last: Command | None) -> Any:
     return learned.later() if hasattr(learned, "later") else learned
 
 
-def _continue_last_plan(
+def _plan_of_policy(
     controller: Controller, last: Command | None, on_failure: OnFailure
 ) -> Decision | None:
-    """Returns the last plan one step on; None where there is none to be applied."""
+    """Returns the last plan one step on, with the input of the policy as its first.
+
+    None where there is none to be applied.
+    """
     if last is None or last.plan is None or not last.plan.applicable:
         return None
-    plan = last.plan
-    inputs = one_step_on(plan.inputs)
-    first = last.input if on_failure == "hold" else inputs[0]
+    plan = _one_step_on(last.plan)
+    input = _input_of_policy(on_failure, plan, last)
     # bounds may change from stage to stage
-    first = _within_bounds(controller, first, last.input)
-    shifted = replace(
-        _with_first(plan, inputs, first),
+    input = _within_bounds(controller, input, last.input)
+    return _admit(controller, _with_first(plan, plan.inputs, input), last)
+
+
+def _input_of_policy(
+    on_failure: OnFailure, plan: Decision, last: Command
+) -> np.ndarray:
+    """Returns the input (m,) of a failed step; bounds are looked after elsewhere.
+
+    Args:
+        on_failure: The policy.
+        plan: The last one, shifted to this step.
+        last: Command of the step before.
+    """
+    if on_failure == "hold":
+        return last.input
+    return plan.inputs[0]
+
+
+def _one_step_on(plan: Decision) -> Decision:
+    """Returns a plan as if it had been made one step ago; its ends are held."""
+    return replace(
+        plan,
+        inputs=one_step_on(plan.inputs),
         means=one_step_on(plan.means),
         covariances=one_step_on(plan.covariances),
         stage_costs=np.empty(0),  # those of the plan before it was shifted
         violation=math.nan,  # likewise
     )
-    return _admit(controller, shifted, last)
 
 
 def _plan_without_prediction(

@@ -223,3 +223,5 @@ def test_an_error_of_the_numbers_of_the_estimate_costs_no_input():
     loop.input(x, GOAL)
     assert loop.failures == 0
     assert loop.last.decision.disturbance == pytest.approx(estimate)
+    loop.input(x, GOAL, plan=np.zeros((10, 1)))
+    assert loop.failures == 0
