@@ -46,6 +46,7 @@ _VIOLATED = 1e-6  # violation of a constraint from which on it counts as missed
 _CLIMBED = 0.1  # of its first cost, from which on plans that cost ever more count
 _RISEN = 2.0  # of its first cost, from which on they are lost
 _ROUNDING = 1e-9
+_UNSOLVED = 1e-7  # of a state's size, which a plan solved to a tolerance may miss
 _MEDIAN = 0.455  # of a chi-square of one degree
 
 # Why a step is not healthy.
@@ -403,7 +404,7 @@ def _follow_innovation(state, innovation, model_noise):
     state.motion = motion
     if not is_judged:
         return 0.0, 0.0
-    size = _ROUNDING * max(1.0, abs(state.measured))
+    size = _UNSOLVED * max(1.0, abs(state.measured))
     variance = size * size + state.predicted_variance + model_noise
     variance += _MISSED_MOTION * _MISSED_MOTION * motion
     if variance != variance:  # the plan does not say how uncertain it is

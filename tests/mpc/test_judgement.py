@@ -307,6 +307,13 @@ def test_a_tank_that_runs_away_is_lost_though_programs_solve(horizon, level):
         assert "the horizon is too short for the plant" in rollout.judgement.reason
 
 
+def test_what_plans_miss_at_rest_is_no_alarm():
+    flown = tank(60, steps=260)
+    innovations = flown.measured[1:] - flown.predicted_means[:-1]
+    assert 0.0 < np.abs(innovations[-60:]).max() < 1e-7
+    assert {judgement.level for judgement in flown.judgements[-60:]} == {"healthy"}
+
+
 @pytest.mark.parametrize("preview", [True, False])
 def test_a_jump_of_the_set_point_is_no_alarm(preview):
     states = np.zeros((121, 2))
