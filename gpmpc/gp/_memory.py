@@ -30,6 +30,28 @@ def check_memory(size: int, outputs: int) -> None:
     )
 
 
+def check_sparse_memory(size: int, outputs: int, inducing: int) -> None:
+    """Raises ``DataError`` where sparse GPs would not fit the available memory.
+
+    Args:
+        size: Number of training points, N.
+        outputs: Number of GPs, k.
+        inducing: Number of inducing points, M.
+    """
+    available = available_memory()
+    count = min(inducing, size)
+    # The rows of the factor that chooses the points.
+    needed = 8 * outputs * count * size
+    if available is None or needed <= available:
+        return
+    raise DataError(
+        f"sparse GPs of {size} points, {count} inducing points and {outputs} outputs "
+        f"need {needed / _GIB:.3g} GiB; {available / _GIB:.3g} GiB are available: take "
+        f"{int(available / needed * count)} inducing points or fewer, or train on "
+        "fewer rows"
+    )
+
+
 def available_memory(system: Path = Path("/")) -> int | None:
     """Returns the bytes that this process may still take without swapping.
 

@@ -80,7 +80,7 @@ def check_prior_settings(
 ) -> None:
     """Raises ``SettingError`` unless the settings of columns at rest are right."""
     for value in _lengthscale_list(prior_lengthscale):
-        if value == NO_EFFECT:
+        if isinstance(value, str) and value == NO_EFFECT:
             continue
         try:
             check_number("prior_lengthscale", value, above=0)

@@ -173,13 +173,14 @@ class OutputSearch:
         prior = features.prior_lengthscales
         ignored = features.constant & np.isinf(prior)
         self._log_prior = np.log(np.where(ignored, IGNORED * features.scales, prior))
-        # Units of the length-scales: standard deviations, or the prior length-scales
-        # of features at rest.
+        # Where the search takes length-scales to be: the features' standard deviations,
+        # or the prior length-scales of those at rest. It differs from the prior above
+        # for a feature without effect alone, whose prior is outside of the box.
         at_rest = features.constant & ~ignored
-        self._log_units = np.log(np.where(at_rest, prior, features.scales))
+        self._log_scales = np.log(np.where(at_rest, prior, features.scales))
         self._log_output = np.log(output_std(targets))
         self._box = search_box(
-            self._log_units, self._log_output, settings.signal_to_noise_limit
+            self._log_scales, self._log_output, settings.signal_to_noise_limit
         )
         # Of the points of the present search; ``_use_points`` sets both.
         self._likelihood: NegativeLogMarginalLikelihood
@@ -233,7 +234,7 @@ class OutputSearch:
         deviations of the features: among the data the output is known, far from them it
         is not. A single row leaves the noise open as well: that of the plain start.
         """
-        log_lengthscales = self._log_units + np.log(_SMOOTH)
+        log_lengthscales = self._log_scales + np.log(_SMOOTH)
         log_lengthscales[self._constant] = self._log_prior[self._constant]
         signal = max(deviation, np.abs(self._targets).max())
         ratio = min(_REPEATED, self._settings.signal_to_noise_limit)
@@ -251,8 +252,8 @@ class OutputSearch:
         self, first: np.ndarray | None, perturbations: np.ndarray
     ) -> list[np.ndarray]:
         """The points where the exploration begins."""
-        plain = np.append(self._log_units, [self._log_output, np.log(_PLAIN_RATIO)])
-        longer = np.append(np.full(len(self._log_units), _LONGER), [0.0, 0.0])
+        plain = np.append(self._log_scales, [self._log_output, np.log(_PLAIN_RATIO)])
+        longer = np.append(np.full(len(self._log_scales), _LONGER), [0.0, 0.0])
         starts = [plain if first is None else first]
         starts += [plain + longer + shift for shift in perturbations]
         return starts
@@ -303,14 +304,14 @@ class OutputSearch:
         """Computes the negative log marginal likelihood plus penalty, and gradient."""
         with np.errstate(over="ignore", invalid="ignore"):
             value, gradient = self._likelihood(theta)
+            if self._settings.penalty is not None:
+                penalty, slope = self._settings.penalty(theta, self._log_scales)
+                value = value + penalty
+                gradient = gradient + slope
         self.evaluations += 1
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             value = FAILED
             gradient = np.zeros_like(theta)
-        elif self._settings.penalty is not None:
-            penalty, slope = self._settings.penalty(theta, self._log_units)
-            value = value + penalty
-            gradient = gradient + slope
         if time.perf_counter() - self._last_log > _LOG_INTERVAL:
             self._last_log = time.perf_counter()
             _log.info(

@@ -29,6 +29,7 @@ from gpmpc.gp._data_checks import (
     checked_targets,
 )
 from gpmpc.gp._kernel import Hyperparameters, kernel_matrix
+from gpmpc.gp._memory import check_sparse_memory
 from gpmpc.gp._prior_scales import PriorLengthscales
 from gpmpc.gp._scaling import Scaling, centre, identity
 from gpmpc.gp._search import FAILED, output_std, plain_theta, search_box
@@ -144,6 +145,7 @@ class SparseTrainer:
             columns=columns,
             settings=self,
         )
+        check_sparse_memory(len(data), data.targets.shape[1], self.inducing)
         # A stationary kernel depends on differences; those from one of the points are
         # exact, wherever the data lie.
         scaling = Scaling(data.features[0], data.feature_scaling.factor)
@@ -351,9 +353,13 @@ def informative_points(
     ``count`` come back where nothing is left to explain: less than round-off of every
     output's variance.
 
+    Raises:
+        SettingError: ``count`` is no number of points.
+
     See Also:
         ``SparseTrainer``; ``SlidingWindow``.
     """
+    check_number("count", count, least=0, whole=True)
     lengthscales, signal_variance, noise_variance = hyperparameters
     round_off = 1e-10 * signal_variance
     unexplained = signal_variance[:, None].repeat(1, len(features))

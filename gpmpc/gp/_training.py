@@ -188,7 +188,9 @@ class Trainer:
 
         The search goes on from the posterior's hyperparameters, with ``restarts=0``
         from them alone. The prior mean is that of this trainer's scaling, as in any
-        training.
+        training. ``prior_deviation`` counts in the units of the targets, for the GPs of
+        a residual too: a posterior does not know what a step changes. There it is to be
+        set, or the whole model to be trained again.
 
         Raises:
             UnsupportedModel: The posterior holds a sparse model's pseudo-observations,
@@ -204,9 +206,10 @@ class Trainer:
         features = posterior.features.to("cpu", torch.float64)
         targets = posterior.targets.to("cpu", torch.float64)
         if transitions is not None:
-            targets = torch.cat([targets, targets_of(posterior, transitions)])
+            new_targets = targets_of(posterior, transitions)
             warn_of_turns(transitions)
-            features = torch.cat([features, transitions.features])
+            targets = torch.cat([targets, new_targets.cpu()])
+            features = torch.cat([features, transitions.features.cpu()])
         training = self.fit(
             features,
             targets,
@@ -292,7 +295,8 @@ class Trainer:
         targets = data.scaled_targets.numpy()
         first = self._first_starts(data, features, start)
         rng = np.random.default_rng(seed)
-        # The first start has none: its numbers are drawn, and left.
+        # The first start needs none. Its row is drawn and not used: without it a seed
+        # would mean other starts than it always did.
         perturbations = rng.normal(size=(k, self.restarts + 1, d + 2))
         rows = self._first_rows(size, rng, has_start=start is not None)
 
@@ -388,10 +392,11 @@ class Trainer:
         """Raises ``TrainingError`` where every start of an output failed (k,)."""
         failed: list[int] = np.flatnonzero(objective >= FAILED).tolist()
         if failed:
+            penalty = "" if self.penalty is None else " and a finite penalty"
             raise TrainingError(
                 failed,
                 f"no start of {self.restarts + 1} led to a positive definite kernel "
-                f"matrix for {', '.join(names[a] for a in failed)}: lower "
+                f"matrix{penalty} for {', '.join(names[a] for a in failed)}: lower "
                 "signal_to_noise_limit, or remove duplicate rows",
             )
 

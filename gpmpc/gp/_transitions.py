@@ -28,13 +28,17 @@ from gpmpc.exceptions import (
     SettingError,
     ShapeError,
     UnsupportedModel,
+    check_choice,
     check_number,
 )
-from gpmpc.gp._storage import consistent, read_npz, write_npz
+from gpmpc.gp._storage import brief, consistent, read_npz, write_npz
+from gpmpc.gp._tensor_checks import PREDICTS
 from gpmpc.signals import UNKNOWN, Signals, check_signals, signals_of
 
 _NAMES = ("states", "inputs", "next_states")
 _EXPECTED = "a file of transitions"
+_FORMAT = "gpmpc transitions"
+_VERSION = 1  # of the format
 
 
 @explains_arguments
@@ -128,8 +132,10 @@ class Transitions:
         turn: a sensor may wrap them.
 
         Raises:
+            SettingError: ``predicts`` is no such word.
             UnsupportedModel: They predict values, which transitions do not hold.
         """
+        check_choice("predicts", predicts, PREDICTS)
         if predicts == "value":
             raise UnsupportedModel(
                 "transitions hold no targets of GPs with predicts='value': use "
@@ -151,7 +157,7 @@ class Transitions:
     def save(self, path: str | Path) -> None:
         """Writes an uncompressed ``.npz`` (no pickle), in one piece or not at all."""
         arrays = {name: getattr(self, name).numpy(force=True) for name in _NAMES}
-        header: dict[str, Any] = {"format": "gpmpc transitions", "format_version": 1}
+        header: dict[str, Any] = {"format": _FORMAT, "format_version": _VERSION}
         header["signals"] = self.signals.to_header()
         write_whole(new_file(path), write_npz(header, arrays))
 
@@ -160,11 +166,14 @@ class Transitions:
         """Reads what ``save`` wrote, or ``numpy.savez`` of arrays with the same names.
 
         Raises:
-            DataError: The file is missing, damaged, or not such a file.
+            DataError: The file is missing, damaged, of a newer format, or not such a
+                file.
         """
         path = existing_file(path, _EXPECTED)
         with consistent(path, "not a readable .npz file of transitions"):
             header, arrays = read_npz(path, _NAMES)
+        _check_format(path, header)
+        with consistent(path, "not a readable .npz file of transitions"):
             stated = header.get("signals") if isinstance(header, dict) else None
             signals = Signals.from_header(stated)
         missing = [name for name in _NAMES if name not in arrays]
@@ -268,6 +277,24 @@ class Transitions:
         else:
             after = after[:, order]
         return _from_file(path, x, u, after, signals)
+
+
+def _check_format(path: Path, header: Any) -> None:
+    """Raises ``DataError`` where a header is that of other files, or of newer ones.
+
+    ``numpy.savez`` writes none.
+    """
+    if header is None:
+        return
+    stated = header.get("format") if isinstance(header, dict) else header
+    if stated != _FORMAT:
+        raise DataError(f"{path}: holds {brief(stated)}; expected {_EXPECTED}")
+    version = header.get("format_version")
+    if type(version) is not int or not 1 <= version <= _VERSION:
+        raise DataError(
+            f"{path}: written in format {version!r:.80}; this version reads up to "
+            f"{_VERSION}: update gpmpc"
+        )
 
 
 def signals_of_tables(signals: Signals, states: Any, inputs: Any) -> Signals:

@@ -8,12 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc._angles import TURN, whole_turns
+from gpmpc._angles import TURN
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, to_array
 from gpmpc.exceptions import ShapeError, UnsupportedModel
 
-_POINTS = 3  # at which a function shows whether it wraps an angle
+_POINTS = 8  # of each range at which a function shows whether it wraps an angle
+_RANGES = ((-1.0, 1.0), (0.1, 2.0))  # roots and logarithms need positive numbers
+_TURN_IS_LOST = 1e-6  # [rad] that a value moves by at most for a turn of its angle
 
 
 @explains_arguments
@@ -125,14 +127,23 @@ class CasadiFunction:
         return self._counting[angles]
 
     def _wraps(self, angle: int) -> bool:
-        """Returns whether a turn more of an angle is none of its next value."""
+        """Returns whether a turn more of an angle is none of its next value.
+
+        One point where it is lost is enough: a function may wrap on one branch alone.
+        Where no point has a value, the function counts as one that wraps: its angles
+        are then within half a turn of the state's, as those of any other are.
+        """
         rng = np.random.default_rng(0)
-        points = [rng.uniform(-1.0, 1.0, (_POINTS, size)) for size in self.sizes]
+        points = [
+            np.concatenate([rng.uniform(*ends, (_POINTS, size)) for ends in _RANGES])
+            for size in self.sizes
+        ]
         before, *_ = self.linearize(*points)
         points[0][:, angle] += TURN
         after, *_ = self.linearize(*points)
-        change = after[:, angle] - before[:, angle]
-        return bool((whole_turns(change) == 0.0).all())
+        change = (after - before)[:, angle]
+        change = change[np.isfinite(change)]
+        return not change.size or bool((np.abs(change) < _TURN_IS_LOST).any())
 
     def linearize(self, *arguments: Array) -> tuple[Array, ...]:
         """Computes values and derivatives at K points.
@@ -166,7 +177,8 @@ class CasadiFunction:
 
         K = len(arguments[0])
         rows, columns = self.shape
-        points = np.ascontiguousarray(np.hstack(arguments))
+        # the kernel takes any array for one of doubles
+        points = np.ascontiguousarray(np.hstack(arguments), dtype=np.float64)
         values = np.empty((K, rows * columns))
         jacobian = np.empty((K, rows * columns, points.shape[1]))
         linearize_tape.unchecked(self.tape, points, values, jacobian)

@@ -23,8 +23,10 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpmpc._dynamics import Array
+from gpmpc.gp._data_checks import constant_columns
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._windows import Windows
 
@@ -141,6 +143,8 @@ class Correction:
             if step <= predicted.shape[1]:
                 knots.append(step)
                 corrections.append(self._at(i, windows, predicted[:, step - 1]))
+        if len(knots) == 1:  # the rollouts end before the first step
+            return predicted
         if predicted.shape[1] > self.steps[-1]:
             knots.append(2 * self.steps[-1])
             corrections.append(np.zeros_like(corrections[0]))
@@ -214,7 +218,10 @@ def _moments(
     """Computes the moments of the errors of states (W, n) at a step."""
     regressors = _regressors(kinematics, windows, predicted, step)
     mean = regressors.mean(axis=0)
-    deviation = np.maximum(regressors.std(axis=0), 1e-12)
+    # What moves by round-off keeps its unit: scaled to one it would be fitted as if it
+    # said something.
+    at_rest = _at_rest(windows, regressors)
+    deviation = np.where(at_rest, 1.0, regressors.std(axis=0))
     z = _standardized(regressors, mean, deviation)
     errors = windows.space.difference(measured, predicted)
     return _Moments(mean, deviation, z.T @ z, z.T @ errors, len(z))
@@ -275,6 +282,29 @@ def _regressors(
     columns.append(np.zeros((len(windows), missing)))
     columns.append(windows.space.difference(predicted, start))
     return np.concatenate(columns, axis=1)
+
+
+def _at_rest(windows: Windows, regressors: Array) -> NDArray[np.bool_]:
+    """Finds the regressors (r,) that move by no more than round-off.
+
+    The round-off of a difference is that of the states: of a place on a map, not of
+    the millimetres that a vehicle has moved since.
+    """
+    space = windows.space
+    starts = windows.states[:, windows.past]
+    entries = np.abs(space.difference(starts, space.origin)).max(axis=0)
+    input_columns = (len(LAGS) + BINS) * windows.inputs.shape[-1]
+    differences = (len(LAGS) + 1) * len(entries)
+    features = regressors.shape[1] - differences - input_columns
+    magnitudes = np.concatenate(
+        [
+            np.zeros(features),  # those and the inputs have their own
+            np.tile(entries, len(LAGS)),
+            np.zeros(input_columns),
+            entries,
+        ]
+    )
+    return constant_columns(regressors, resolution=0.0, magnitudes=magnitudes)
 
 
 def _standardized(regressors: Array, mean: Array, deviation: Array) -> Array:

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from gpmpc._angles import state_difference, wrap
+from gpmpc.gp._data_checks import constant_columns
 from gpmpc.models._features import Features
 from gpmpc.models._nominal import Affine
 from gpmpc.models._residual_data import Nominal, nominal_next_state
@@ -70,7 +71,8 @@ def kinematic_residual(
     change = state_difference(next_states, predicted, features.angles)
     basis = _basis(torch.cat(features(states, inputs), dim=1))
     effect = torch.eye(n, dtype=states.dtype)
-    noise = torch.zeros(n, dtype=states.dtype)
+    # What is not learned of each state's change, at every row (N, n).
+    missed = torch.zeros_like(states)
     learned = list(range(n))
     for rate, position in _from_the_highest(rates):
         unexplained = change[:, position]
@@ -84,16 +86,18 @@ def kinematic_residual(
         A[position] += time_step * A[rate] * c
         A[position, rate] += time_step * (1 - c)
         effect_by_rate = c * time_step * effect[rate]
+        # What is missed of a rate is missed of its position as well.
+        missed[:, position] = c * time_step * missed[:, rate]
         if _is_learnable(remainder, basis):
             effect[position] += effect_by_rate
             continue
         effect[position] = effect_by_rate
-        noise[position] = remainder.square().mean()
+        missed[:, position] += remainder
         learned.remove(position)
     if nominal is None:
         identity = Affine.identity(n, inputs.shape[1])
         nominal = Affine(A=A, B=identity.B, c=identity.c)
-    return KinematicResidual(nominal, effect[:, learned], noise)
+    return KinematicResidual(nominal, effect[:, learned], missed.square().mean(dim=0))
 
 
 def _from_the_highest(rates: Mapping[int, int]) -> list[tuple[int, int]]:
@@ -113,7 +117,10 @@ def _basis(features: Tensor) -> Tensor:
     """
     size, d = features.shape
     spread = features.std(dim=0, correction=0)
-    scaled = (features - features.mean(dim=0)) / spread.clamp(min=1e-12)
+    at_rest = torch.from_numpy(constant_columns(features.numpy(), resolution=0.0))
+    # What moves by round-off keeps its unit, and drops out below.
+    scale = torch.where(at_rest, 1.0, spread)
+    scaled = (features - features.mean(dim=0)) / scale
     one = torch.ones(size, 1, dtype=features.dtype)
     columns = [one, scaled, scaled.square()]
     if 1 + d + d * (d + 1) // 2 <= size // _ROWS_PER_TERM:

@@ -198,10 +198,10 @@ def _check_slopes(
 
     Args:
         key: What the function is, for the message.
-        function: f(x, u) (K, n).
+        function: f(x, u) (K, v).
         x: (K, n).
         u: (K, m).
-        slopes: Its derivatives by x and u (K, n, n + m).
+        slopes: Its derivatives by x and u (K, v, n + m).
     """
     points = np.concatenate([x, u], axis=1)
     n = x.shape[1]
@@ -244,4 +244,11 @@ def check_derivatives(nominal: Nominal, B: Effect, transitions: Transitions) -> 
             _check_slopes("nominal", checked, x, u, np.concatenate([A, B_u], axis=2))
         if callable(B) and not hasattr(B, "linearize"):
             checked_effect = partial(effect_matrix, B)
-            linearize_function(checked_effect, transitions.states, x)
+            effect, slopes = linearize_function(checked_effect, transitions.states, x)
+            _check_slopes(
+                "B",
+                lambda states, _: checked_effect(states).flatten(start_dim=1),
+                x,
+                u[:, :0],
+                slopes.reshape(len(x), effect[0].size, x.shape[1]),
+            )

@@ -9,7 +9,13 @@ import numpy as np
 from torch import Tensor
 
 from gpmpc._calls import explains_arguments
-from gpmpc._dynamics import Array, DynamicsModel, linearize, to_array
+from gpmpc._dynamics import (
+    Array,
+    DynamicsModel,
+    check_next_states,
+    linearize,
+    to_array,
+)
 from gpmpc._kernels import GPArrays
 from gpmpc._kernels.gp_rollout import (
     COSINE,
@@ -54,11 +60,15 @@ class RollOut:
     other takes one call for each stage: of its ``predict_mean`` where it has that
     method, else of ``linearize``.
 
+    Raises:
+        SettingError: The model does not predict as many values as it has states.
+
     See Also:
         ``gpmpc.propagation.rollout``, which carries a belief along.
     """
 
     def __init__(self, model: DynamicsModel):
+        check_next_states(model)
         self._model = model
         self._compiled_model = _compiled_model(model)
 
@@ -78,12 +88,11 @@ class RollOut:
         Raises:
             ShapeError: They do not belong to the model, or to each other.
         """
+        feedback = Feedback(*[_doubles(part) for part in feedback])
         T, H, m = feedback.inputs.shape
         n = self._model.state_dim
-        start = np.ascontiguousarray(start, dtype=float)
-        if disturbance is None:
-            disturbance = np.zeros(n)
-        disturbance = np.ascontiguousarray(disturbance, dtype=float)
+        start = _doubles(start)
+        disturbance = _doubles(np.zeros(n) if disturbance is None else disturbance)
         self._check_shapes(start, feedback, disturbance)
         if self._compiled_model is None:
             return self._stage_by_stage(start, feedback, disturbance)
@@ -115,7 +124,7 @@ class RollOut:
         Raises:
             ShapeError: They do not belong to the model, or to each other.
         """
-        inputs = np.ascontiguousarray(inputs, dtype=float)
+        inputs = _doubles(inputs)
         if inputs.ndim != 3:
             raise ShapeError(f"inputs must be (T, H, m); got {inputs.shape}")
         T, H, m = inputs.shape
@@ -192,6 +201,14 @@ class RollOut:
         if predict_mean is not None:
             return predict_mean(states, inputs)
         return linearize(self._model, states, inputs, covariance=False).mean
+
+
+def _doubles(values: Array) -> Array:
+    """Returns values as compiled code reads them without a look: one after the other.
+
+    Values that are so already are not copied.
+    """
+    return np.ascontiguousarray(values, dtype=np.float64)
 
 
 def _feedback_input(

@@ -116,11 +116,13 @@ def log_model_parts(
     for name, part in _regressions(model).items():
         for key in _REGRESSION_TENSORS:
             tensors[f"{name}/{key}"] = torch.from_numpy(getattr(part, key))
+    if not model.memory.empty:
+        header["memory"] = asdict(model.memory)
+    if model.without_nominal:
+        header["without_nominal"] = model.without_nominal
     if len(model.time_constants):
         tensors["time_constants"] = torch.from_numpy(model.time_constants)
     if model.weights.size:
-        header["memory"] = asdict(model.memory)
-        header["without_nominal"] = model.without_nominal
         tensors["weights"] = torch.from_numpy(model.weights)
     return header, tensors
 

@@ -25,7 +25,7 @@ _SHORT_STEP = 0.01  # [s] of a substep of the integration, about
 _MOST_SUBSTEPS = 10
 _KEPT = 100  # systems, of the parameters that were tried last
 _ALIKE = 1e-9  # between two ways to the same outputs
-_DISPLACED = 1.07  # factor of a parameter for which they are compared
+_DISPLACED = 0.07  # part of a parameter by which it moves where they are compared
 
 
 @dataclass(frozen=True)
@@ -190,18 +190,30 @@ class SystemNominal:
         attributes = [hasattr(self._system.dynamics, n) for n in self.parameter_names]
         if not all(attributes):
             return False
-        displaced = np.clip(self.start * _DISPLACED + 1e-3, *self.bounds)
         states = np.linspace(0.1, 0.7, len(self.state_names))[None, None]
         inputs = np.linspace(0.2, 0.5, len(self.input_names))[None, None]
-        columns = [
-            values.reshape(2, 1) for values in np.stack([self.start, displaced]).T
-        ]
+        columns = [column[:, None] for column in self._displaced_one_by_one().T]
         try:
             together = self._rates(self._with_arrays(columns), states, inputs)
             by_factory = self._outputs_one_by_one(columns, states, inputs)
         except Exception:  # whatever dynamics raise that take one number only
             return False
         return np.allclose(together, by_factory, rtol=_ALIKE, atol=_ALIKE)
+
+    def _displaced_one_by_one(self) -> Array:
+        """Returns the start with one parameter moved in each row (P, P).
+
+        Moved together, what is derived of two may stay: a ratio. Each moves away from
+        a bound that it starts on.
+        """
+        low, high = self.bounds
+        length = _DISPLACED * np.abs(self.start) + 1e-3
+        above = np.minimum(self.start + length, high)
+        below = np.maximum(self.start - length, low)
+        is_room_above = high - self.start >= self.start - low
+        rows = np.tile(self.start, (len(self.start), 1))
+        np.fill_diagonal(rows, np.where(is_room_above, above, below))
+        return rows
 
     def _outputs_one_by_one(
         self, parameters: Sequence[Array], states: Array, inputs: Array

@@ -52,7 +52,8 @@ from gpmpc.propagation._propagator import (
 )
 
 _log = logging.getLogger(__name__)
-# samples predicted at once: bounds the memory at about chunk * N * outputs numbers
+# samples of all beliefs of a batch that are predicted at once: a GP's points' kernels
+# at them are as many times N * outputs numbers, by torch times n + m
 _CHUNK = 1000
 # part of the points that may lie further than a quarter turn from the first before the
 # log says that turns may be miscounted
@@ -239,7 +240,8 @@ class Unscented(NoisyPropagator):
         centred = values - mean[..., None, :]
         covariance = centred.mT @ (weights.covariance[:, None] * centred)
         own = (weights.mean[:, None, None] * predictions.covariance).sum(-3)
-        # the centre's step is zero, and all other points have the one weight
+        # The centre's step is zero. All other points have one weight, that of the
+        # second, in the mean as in the covariance.
         weight = weights.mean[1]
         return NextMoments(
             mean=mean,
@@ -309,7 +311,8 @@ class MonteCarlo(NoisyPropagator):
         steps = self._draw_steps(belief)
         means = []
         covariances = 0.0
-        for chunk in steps.split(_CHUNK, dim=-2):
+        beliefs = steps.shape[:-2].numel()
+        for chunk in steps.split(max(_CHUNK // max(beliefs, 1), 1), dim=-2):
             states = belief.mean[..., None, :] + chunk
             predictions = model.predict(states, _repeated(input, states))
             means.append(predictions.mean)

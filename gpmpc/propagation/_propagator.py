@@ -24,6 +24,8 @@ from gpmpc.gaussian import (
 )
 from gpmpc.signals import Signals, signals_of
 
+_LAST_PLACES = 2**12  # units in it, of the round-off that a covariance may have
+
 
 @dataclass(frozen=True, eq=False)
 class Propagation:
@@ -305,25 +307,50 @@ def _check_finite(name: str, array: np.ndarray) -> None:
 
 
 def _check_semidefinite(covariance: np.ndarray) -> None:
-    precision = np.finfo(covariance.dtype)
-    # of each matrix of a batch: a wide one says nothing of the others
-    largest = np.abs(covariance).max(axis=(-2, -1), keepdims=True, initial=0.0)
-    round_off = precision.eps**0.5 * np.maximum(largest, precision.tiny)
+    """Raises ``DataError`` unless covariances (*batch, n, n) are, up to round-off.
+
+    Each entry is judged beside the variances of its own two states, which may be of
+    very different units.
+    """
+    tolerance = np.finfo(covariance.dtype).eps ** 0.5
+    squares = _squares_of_units(covariance)
     gaps = np.abs(covariance - np.swapaxes(covariance, -1, -2))
-    if (gaps > round_off).any():
+    if gaps.any() and (gaps > tolerance * _products(squares)).any():
         raise DataError(
             "the belief's covariance must be symmetric; got entries that differ by "
             f"{float(gaps.max()):.3g}"
         )
     eye = np.eye(covariance.shape[-1], dtype=covariance.dtype)
     try:
-        np.linalg.cholesky(covariance + round_off * eye)
+        np.linalg.cholesky(covariance + tolerance * squares[..., None] * eye)
     except np.linalg.LinAlgError:
-        lowest = np.linalg.eigvalsh(covariance).min(axis=-1, keepdims=True)[..., None]
-        is_wrong = lowest < -round_off
+        correlations = covariance / _products(squares)
+        is_wrong = np.linalg.eigvalsh(correlations).min(axis=-1) < -tolerance
         if is_wrong.any():
+            first = covariance[is_wrong][0]
             raise DataError(
                 "the belief's covariance must be positive semidefinite; got an "
-                f"eigenvalue of {float(lowest[is_wrong][0]):.3g} "
-                f"(largest entry {float(largest[is_wrong][0]):.3g})"
+                f"eigenvalue of {float(np.linalg.eigvalsh(first).min()):.3g} "
+                f"(largest entry {float(np.abs(first).max()):.3g})"
             ) from None
+
+
+def _squares_of_units(covariance: np.ndarray) -> np.ndarray:
+    """Returns the square (*batch, n) of what each state's deviations are judged in.
+
+    It is the state's variance, or what round-off leaves of it: a product of matrices
+    has the round-off of its largest entry in every entry.
+    """
+    precision = np.finfo(covariance.dtype)
+    # of each matrix of a batch: a wide one says nothing of the others
+    largest = np.abs(covariance).max(axis=(-2, -1), initial=precision.tiny)
+    round_off = _LAST_PLACES * precision.eps * largest
+    variances = np.diagonal(covariance, axis1=-2, axis2=-1)
+    # of which the tolerance's part is the round-off
+    return np.maximum(variances, round_off[..., None] / precision.eps**0.5)
+
+
+def _products(squares: np.ndarray) -> np.ndarray:
+    """Returns the product (*batch, n, n) of each two roots."""
+    roots = np.sqrt(squares)
+    return roots[..., :, None] * roots[..., None, :]

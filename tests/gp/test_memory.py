@@ -1,7 +1,8 @@
 import pytest
+import torch
 
 from gpmpc.exceptions import DataError
-from gpmpc.gp import _memory
+from gpmpc.gp import SparseTrainer, _memory
 from gpmpc.gp._memory import available_memory
 
 
@@ -70,3 +71,21 @@ def test_a_training_too_large_is_refused_with_points_that_fit(monkeypatch):
     )
     with pytest.raises(DataError, match=f"{message}train on 5181 points or fewer"):
         _memory.check_memory(20_000, 3)
+
+
+def test_a_sparse_training_too_large_is_refused_before_the_work(monkeypatch):
+    needed = 8 * 2 * 50 * 1000  # [bytes]
+    for free in (needed, None):
+        monkeypatch.setattr(_memory, "available_memory", lambda free=free: free)
+        _memory.check_sparse_memory(1000, 2, inducing=50)
+    monkeypatch.setattr(_memory, "available_memory", lambda: needed - 1)
+    with pytest.raises(DataError, match="take 49 inducing points or fewer"):
+        _memory.check_sparse_memory(1000, 2, inducing=50)
+    monkeypatch.setattr(_memory, "available_memory", lambda: 2**30)
+    x = torch.zeros(200_000, 1, dtype=torch.float64)
+    message = (
+        "sparse GPs of 200000 points, 2000 inducing points and 6 outputs need 17.9 "
+        "GiB; 1 GiB are available: take 111 inducing points or fewer"
+    )
+    with pytest.raises(DataError, match=message):
+        SparseTrainer(inducing=2000).fit(x, x.expand(-1, 6), 0, "value")

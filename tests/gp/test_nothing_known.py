@@ -330,6 +330,10 @@ def test_one_who_knows_says_so_and_is_told_nothing(caplog):
             {"prior_lengthscale": math.nan},
             "prior_lengthscale: must be numbers above 0, or 'no_effect'",
         ),
+        (
+            {"prior_lengthscale": np.array([1.0, 2.0])},
+            r"prior_lengthscale: must be numbers .* got array\(\[1., 2.\]\)",
+        ),
         ({"prior_deviation": 0.0}, "prior_deviation: must be a number above 0"),
         ({"prior_deviation": math.inf}, "prior_deviation: must be a number above 0"),
         ({"resolution": -1.0}, "resolution: must be a number, 0 or more; got -1.0"),

@@ -247,6 +247,13 @@ def test_a_frozen_sparse_model_is_used_like_any_other(method):
         Trainer().refit(gp)
 
 
+@pytest.mark.parametrize("count", [-1, 1.5, "all"])
+def test_the_number_of_informative_points_is_one(count):
+    one = torch.ones(1, dtype=torch.float64)
+    with pytest.raises(SettingError, match="count: must be a whole number"):
+        informative_points(one[:, None], (one[:, None], one, one), count)
+
+
 def test_informative_points_differ_and_end_with_the_information():
     x, _, settings = problem(100)
     chosen = torch.cat([x, x])[

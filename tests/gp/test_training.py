@@ -501,3 +501,23 @@ def test_a_time_limit_leaves_one_start_and_one_iteration(monkeypatch):
     assert sizes == [20, 60, 20, 60]
     assert (training.objective > converged.objective).all()
     assert len(training.posterior) == 60
+
+
+def test_a_penalty_that_is_no_number_is_no_success():
+    def nowhere(theta, log_std):
+        return np.nan, np.zeros_like(theta)
+
+    def without_slope(theta, log_std):
+        return 0.0, np.full_like(theta, np.nan)
+
+    for penalty in (nowhere, without_slope):
+        with pytest.raises(TrainingError, match="no start of 2 .* finite penalty for"):
+            train(pendulum(8), penalty=penalty, restarts=1)
+
+
+def test_a_start_behind_a_wall_of_infinite_height_is_a_failed_one(recwarn):
+    wall = SoftLimits(lengthscale_factor=1.01, power=200)
+    training = train(pendulum(8), penalty=wall, restarts=1)
+    assert (training.objective < 100.0).all()
+    assert (training.explored[:, 1] == _search.FAILED).all()
+    assert not recwarn.list

@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.exceptions import DataError, ShapeError
+from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gp import Transitions
+from gpmpc.gp._storage import write_npz
 
 ROW = " ".join(str(float(i)) for i in range(15))
 
@@ -103,6 +104,33 @@ def test_an_archive_of_something_else_is_named(tmp_path):
     np.savez(tmp_path / "other.npz", states=np.zeros((1, 1)))
     with pytest.raises(DataError, match="array 'inputs' is missing"):
         Transitions.load(tmp_path / "other.npz")
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ({"format_version": 2}, "written in format 2; this version reads up to 1"),
+        ({"format_version": None}, "written in format None"),
+        ({"format_version": True}, "written in format True"),
+        ({"format": "gpmpc model"}, "holds gpmpc model; expected a file of trans"),
+    ],
+)
+def test_a_newer_or_another_format_is_named(transitions, tmp_path, header, message):
+    path = tmp_path / "data.npz"
+    arrays = {
+        name: getattr(transitions, name).numpy()
+        for name in ("states", "inputs", "next_states")
+    }
+    usual = {"format": "gpmpc transitions", "format_version": 1}
+    path.write_bytes(write_npz(usual | header, arrays))
+    with pytest.raises(DataError, match=rf"data\.npz: {message}"):
+        Transitions.load(path)
+
+
+@pytest.mark.parametrize("predicts", ["differences", "Difference", None])
+def test_targets_are_of_one_of_the_kinds(transitions, predicts):
+    with pytest.raises(SettingError, match="predicts: "):
+        transitions.targets(predicts)
 
 
 def test_the_authors_text_format_is_read(tmp_path):

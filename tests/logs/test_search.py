@@ -662,3 +662,39 @@ def test_the_same_seed_gives_the_same_numbers(control):
         first.model.rollout(windows), again.model.rollout(windows)
     )
     assert (first.control is not None) == control
+
+
+def test_what_moves_by_round_off_says_nothing():
+    """A place on a map where a vehicle stands, and an input that is held."""
+    log = reactor_log(400)
+    rng = np.random.default_rng(0)
+    (run,) = log.runs
+    place = 5e3 * (1 + rng.uniform(-1, 1, len(run.states)) * 2e-16)
+    held = 9.81 * (1 + rng.uniform(-1, 1, (len(run.states), 1)) * 1e-14)
+    states = np.column_stack([run.states[:, 0], place])
+    log = replace(log, runs=(replace(run, states=states, inputs=held),))
+    windows = log.windows(10, past=20)
+    still = np.repeat(windows.states[:, 20:21], 10, axis=1)
+    (correction,) = Correction.fit_each(
+        Increments(log.space), windows, still, (1, 10), [Prior(0.01)]
+    )
+    moved = replace(
+        windows,
+        states=windows.states + [0.0, 0.01] * np.arange(31)[:, None],
+        inputs=windows.inputs + 0.01,
+    )
+    start = np.repeat(moved.states[:, 20:21], 10, axis=1)
+    change = correction(moved, start) - start
+    assert np.abs(change[..., 0]).max() < 0.5
+    assert np.abs(change[..., 1]).max() < 1e-6
+
+
+def test_rollouts_that_end_before_the_first_step_stay(recwarn):
+    log = reactor_log(200)
+    windows = log.windows(10, past=20)
+    still = np.repeat(windows.states[:, 20:21], 10, axis=1)
+    (correction,) = Correction.fit_each(
+        Increments(log.space), windows, still, (5, 10), [Prior(0.01)]
+    )
+    assert np.array_equal(correction(windows, still[:, :3]), still[:, :3])
+    assert not recwarn.list

@@ -562,3 +562,43 @@ def test_the_pages_systems_are_fitted_by_its_mappings(tmp_path, monkeypatch):
         slow = table.assign(time=0.02 * np.arange(200))
         log = log_of(tmp_path, slow, {**mapping, "nominal": nominal})
         assert bases(log, 40)[0].name == "make_rod"
+
+
+class Oscillator:
+    """Derives a ratio of its parameters where it is made."""
+
+    state_dim = 2
+    input_dim = 1
+    state_names = ("position", "speed")
+    input_names = ("force",)
+
+    def __init__(self, mass=1.0, stiffness=1.0):
+        self.mass = mass
+        self.stiffness = stiffness
+        self.ratio = stiffness / mass
+
+    def derivative(self, x, u):
+        return [x[1], u[0] - self.ratio * x[0]]
+
+
+@pytest.mark.parametrize(
+    "fitted",
+    [
+        (FittedParameter("mass", 1.0), FittedParameter("stiffness", 1.0)),
+        (FittedParameter("mass", 1.0, low=0.5, high=1.0),),
+        (FittedParameter("mass", 0.5, low=0.5, high=1.0),),
+    ],
+    ids=["equal starts", "a start on its upper bound", "and on its lower one"],
+)
+def test_what_is_derived_of_parameters_follows_them(fitted):
+    nominal = SystemNominal(
+        Oscillator, "own:Oscillator", fitted, 0.01, ("x", "v"), ("u",)
+    )
+    states = np.array([[[0.5, 0.1]]])
+    inputs = np.zeros((1, 1, 1))
+    theta = nominal.start
+    theta[0] = 0.7
+    several = [np.array([[value], [value]]) for value in theta]
+    together = nominal.outputs(several, states, inputs, None)
+    alone = nominal.outputs(theta, states, inputs, None)
+    np.testing.assert_allclose(together[1], alone[0], rtol=1e-12)

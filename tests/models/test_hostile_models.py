@@ -4,6 +4,7 @@ import copy
 import json
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -343,6 +344,22 @@ def test_a_log_model_that_does_not_fit_together_is_refused(tmp_path):
         write(path, good[0] | changed, good[1])
         with pytest.raises(DataError, match=r"^[^\n]*m\.safetensors: [^\n]*$"):
             load_learned(path)
+
+
+def test_outputs_without_a_nominal_model_need_no_memory_in_a_file(tmp_path):
+    from gpmpc.logs import save_learned
+    from tests.models.hostile import of_a_pendulum_log
+
+    learned = of_a_pendulum_log()
+    path = tmp_path / "m.safetensors"
+    model = replace(learned.model, without_nominal=(1,))
+    save_learned(replace(learned, model=model), path)
+    loaded = load_learned(path).model
+    assert loaded.without_nominal == (1,)
+    arguments = (np.array([[0.3, 0.2]]), np.array([[0.1]]), np.empty((1, 0)))
+    outputs = [each.outputs(*arguments) for each in (loaded, model, learned.model)]
+    assert np.array_equal(outputs[0], outputs[1])
+    assert not np.array_equal(outputs[0], outputs[2])
 
 
 @pytest.mark.parametrize("field", ["nominal", "kinematics"])

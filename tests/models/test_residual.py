@@ -316,3 +316,13 @@ def test_models_are_equal_to_themselves_alone():
         assert part in [replace(part), part]
         assert part != replace(part)
         assert len({part, replace(part)}) == 2
+
+
+def test_an_effect_that_torch_loses_a_part_of_is_refused():
+    def effect(x):
+        lost = x[:, 1].detach() ** 2 + 1.0
+        return torch.stack([x[:, 0].cos(), lost, x[:, 2] + 2.0], dim=-1)
+
+    message = r"B: must be followed by torch .* entry 2 by column 2 of \(x, u\)"
+    with pytest.raises(SettingError, match=message):
+        ResidualModel.train(AFFINE, transitions(10), B=effect)

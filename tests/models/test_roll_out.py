@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from gpmpc._kernels.gp_rollout import Feedback
-from gpmpc.exceptions import ShapeError
+from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gp import GPPosterior
 from gpmpc.models import Affine, DisturbedModel, ResidualModel, RollOut, linearize
 
@@ -191,3 +191,37 @@ def test_a_feedback_of_other_shapes_is_refused(part, shape):
     roll_out(np.zeros((2, 3)), feedback)
     with pytest.raises(ShapeError, match="must be of 2 plans of 4 stages, 3 states"):
         roll_out(np.zeros((2, 3)), feedback._replace(**{part: np.zeros(shape)}))
+
+
+@pytest.mark.parametrize("outputs", [1, 2, 4])
+def test_only_a_model_of_next_states_is_rolled_out(outputs):
+    with pytest.raises(SettingError, match=f"next state; got 3 states and {outputs}"):
+        RollOut(gp(3, 2, outputs, "value"))
+
+
+def test_a_feedback_of_whole_numbers_and_strided_arrays_is_taken():
+    free = np.full((4, 2), 9.0)
+    rng = np.random.default_rng(0)
+    feedback = Feedback(
+        states=rng.normal(size=(2, 4, 3)),
+        inputs=np.round(rng.normal(size=(2, 4, 2))),
+        gains=rng.normal(size=(1, 4, 2, 3)),
+        lower=-free,
+        upper=free,
+        rate_lower=-free,
+        rate_upper=free,
+        previous_input=np.ones(2),
+    )
+    roll_out = RollOut(MODELS["differences"]())
+    start = rng.normal(size=(2, 3))
+    expected = roll_out(start, feedback)
+    wide = np.zeros((2, 4, 6))
+    wide[:, :, ::2] = feedback.states
+    same = feedback._replace(
+        states=wide[:, :, ::2],
+        inputs=feedback.inputs.astype(int),
+        upper=np.broadcast_to(np.array([9.0, 9.0]), (4, 2)),
+        previous_input=np.array([1, 1]),
+    )
+    for part, right in zip(roll_out(start, same), expected, strict=True):
+        assert np.array_equal(part, right)

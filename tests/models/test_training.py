@@ -10,7 +10,8 @@ from gpmpc.calibration import Recording, calibrate
 from gpmpc.datasets import RandomData
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gp import GPPosterior, SparseTrainer, Trainer, Transitions, standardize
-from gpmpc.models import ResidualModel, train
+from gpmpc.models import Features, ResidualModel, train
+from gpmpc.models._kinematic_rates import kinematic_residual
 from gpmpc.propagation import Linearization
 from gpmpc.signals import Signals
 from gpmpc.systems import (
@@ -159,6 +160,28 @@ def test_accelerations_move_velocities_and_these_positions():
     assert model.residual.output_dim == 1
     fresh = rows(plant, noise=0.0, seed=1)
     assert one_step_error(model, fresh) < 2e-3
+
+
+def test_noise_of_a_velocity_moves_its_position():
+    rng = np.random.default_rng(0)
+    h = 0.5
+    a, v, p = states = rng.uniform(-1, 1, (3, 300))
+    u = rng.uniform(-1, 1, 300)
+    next_a = a + h * u
+    next_v = v + h * (a + next_a) / 2 + rng.normal(0, 0.1, 300)
+    next_p = p + h * (v + next_v) / 2 + rng.normal(0, 0.001, 300)
+    kinematic = kinematic_residual(
+        rates={0: 1, 1: 2},
+        features=Features([0, 1, 2], [0], [], state_dim=3, input_dim=1),
+        nominal=None,
+        states=torch.from_numpy(states.T),
+        inputs=torch.from_numpy(u[:, None]),
+        next_states=torch.from_numpy(np.column_stack([next_a, next_v, next_p])),
+        time_step=h,
+    )
+    assert kinematic.B.shape == (3, 1)
+    deviations = [0.1, h / 2 * 0.1]  # the second nearly all from the first
+    assert kinematic.noise[1:].sqrt().tolist() == pytest.approx(deviations, rel=0.1)
 
 
 def test_what_a_nominal_model_misses_is_learned():

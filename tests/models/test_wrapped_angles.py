@@ -196,6 +196,22 @@ def test_a_function_that_counts_turns_stays_itself():
     assert wrapping.counting_turns((0,)) is wrapping.counting_turns((0,))
 
 
+def test_a_function_wraps_where_it_has_a_value():
+    """It has none at a negative height, and wraps on the way up alone."""
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u")
+    turned = x[0] + STEP * casadi.sqrt(x[1])
+    wrapped = casadi.atan2(casadi.sin(turned), casadi.cos(turned))
+    for angle in (wrapped, casadi.if_else(x[1] > 1.0, wrapped, turned)):
+        f = casadi.Function("f", [x, u], [casadi.vertcat(angle, x[1])])
+        counting = CasadiFunction(f).counting_turns((0,))
+        values, *_ = counting.linearize(np.array([[20.0, 1.5]]), np.zeros((1, 1)))
+        assert values[0, 0] == pytest.approx(20.0 + STEP * 1.5**0.5)
+    nowhere = casadi.vertcat(wrapped + 0 * casadi.sqrt(-4 - x[1] ** 2), x[1])
+    counting = CasadiFunction(casadi.Function("f", [x, u], [nowhere]))
+    assert counting.counting_turns((0,)) is not counting
+
+
 def test_a_position_may_turn_by_half_a_turn_in_a_step():
     rng = np.random.default_rng(0)
     h = 0.1

@@ -437,6 +437,39 @@ def test_a_wide_belief_over_an_angle_stays_as_wide(n, make):
         assert torch.allclose(mean, exact.belief.mean, atol=loose / 2)
 
 
+def test_a_wide_state_hides_no_negative_variance_of_another():
+    """A place in metres, and an angle."""
+    message = r"an eigenvalue of -0\.01 \(largest entry 1e\+06\)"
+    broken = torch.diag(torch.tensor([1e6, -1e-2]))
+    with pytest.raises(DataError, match=message):
+        MeanEquivalence()(gp(), Gaussian(torch.zeros(2), broken), torch.zeros(1))
+    crooked = torch.diag(torch.tensor([1e6, 1e-6, 1e-6]))
+    crooked[1, 2] = 1e-6
+    with pytest.raises(DataError, match="must be symmetric; .* differ by 1e-06"):
+        MeanEquivalence()(gp(3), Gaussian(torch.zeros(3), crooked), torch.zeros(1))
+    rounded = torch.diag(torch.tensor([1e6, -1e-8]))
+    MeanEquivalence()(gp(), Gaussian(torch.zeros(2), rounded), torch.zeros(1))
+
+
+def test_a_batch_takes_no_more_samples_at_once_than_one_belief():
+    class Counting(KnownModel):
+        most = 0
+
+        def predict(self, state, input):
+            Counting.most = max(Counting.most, state[..., 0].numel())
+            return super().predict(state, input)
+
+    model = Counting(lambda x, u: torch.sin(x) + u, 2, 2)
+    spread = 0.1 * torch.eye(2).expand(50, 2, 2)
+    batch = Gaussian(torch.randn(50, 2), spread)
+    propagator = MonteCarlo(samples=400)
+    after = propagator(model, batch, torch.zeros(50, 2))
+    assert Counting.most <= 1000
+    alone = propagator(model, Gaussian(batch.mean[7], spread[7]), torch.zeros(2))
+    assert torch.allclose(after.mean[7], alone.mean)
+    assert torch.allclose(after.covariance[7], alone.covariance)
+
+
 def test_a_wide_stage_of_a_plan_hides_no_broken_one():
     eye = torch.eye(2)
     batch = Gaussian(torch.zeros(3, 2), torch.stack([0 * eye, 1e8 * eye, -0.1 * eye]))
