@@ -12,9 +12,9 @@
 ``gpmpc.propagation._moments`` states the mathematics and serves torch; here the closed
 forms and their derivatives are evaluated for ``Packed`` arrays, on one thread.
 The moments are those of the k latent functions f of x~ = (x, u), with x ~ N(mu, S) and
-u certain; callers add the previous state, observation noise or a nearest semidefinite
-covariance. Every function takes H points; every array below has H in front of the shape
-that is stated.
+u certain, without the prior mean; callers add that (``linearize_gps`` alone takes it),
+the previous state, observation noise or a nearest semidefinite covariance. All but
+``pack`` take H points; every array below has H in front of the shape that is stated.
 Nothing is kept between calls: any number of threads may call at once.
 """
 
@@ -50,7 +50,7 @@ __all__ = [
 class Expansion(NamedTuple):
     """f at a certain point (x, u): the mean to second order, the variance to first."""
 
-    M: Array  #: the mean (k,)
+    M: Array  #: the mean without its prior (k,)
     variance: Array  #: of the latent functions, not below zero (k,)
     J: Array  #: dM/dx (k, n)
     dM_du: Array  #: (k, m)
@@ -67,7 +67,7 @@ class Moments(NamedTuple):
     + dV_du[a, b] . du; so dM, dJ.
     """
 
-    M: Array  #: E[f] (k,)
+    M: Array  #: E[f] without the prior mean (k,)
     V: Array  #: Cov[f] (k, k)
     J: Array  #: E[df/dx] = dM/dmu (k, n); Cov[x, f] = S J'
     dM_dS: Array  #: (k, n, n); dJ/dmu, the second derivatives of M in mu, is twice that

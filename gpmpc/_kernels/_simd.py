@@ -248,7 +248,7 @@ def total(builder, values):
 
 @_define(types.float64, LANES)
 def largest(builder, values):
-    """Returns the largest of eight numbers >= 0, as ``larger`` gives them."""
+    """Returns the largest of eight numbers >= 0, as ``larger_magnitude`` gives them."""
     for distance in (4, 2):
         values = _larger(builder, values, _rotate(builder, values, distance))
     first, second = _first_two(builder, values)

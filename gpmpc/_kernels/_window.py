@@ -25,7 +25,7 @@ from gpmpc._kernels._gp_point import write_kernel
 from gpmpc._kernels._packed import COLUMNS, Array, GPArrays, aligned
 from gpmpc._kernels._simd import load, store, use_widest_registers
 from gpmpc._kernels.linalg import aligned_rows, four_dots
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import DataError, SettingError
 
 # where a column of L has 1 / L_jj and v_j
 INVERSE = -2
@@ -49,7 +49,7 @@ class Window:
     columns: Array
     state_dim: int  #: n
     input_dim: int  #: m
-    rows: int = 0  #: number of rows of L that are computed; N where the GPs predict
+    rows: int = 0  #: number of rows of L that are computed: N > 0 where the GPs predict
     #: whether a next window may write to ``columns``: one item, which the first takes;
     #: a list, since to take from it is one step also where threads share the window
     _extension_token: list[None] = field(default_factory=lambda: [None])
@@ -80,7 +80,10 @@ class Window:
         )
 
     def without(self, gone: Sequence[int]) -> "Window":
-        """Returns the GPs without some points, and without a row of the factor yet."""
+        """Returns the GPs without some points, and without a row of the factor yet.
+
+        ``arrays`` still has the points and weights of before, which nobody may read.
+        """
         points = self.data[:, : self.arrays.size]
         data = np.ascontiguousarray(np.delete(points, gone, axis=1))
         return Window(
@@ -103,6 +106,7 @@ class Window:
             rows: Number of rows of the factor that there are to be; all by default.
 
         Raises:
+            DataError: An entry is not finite.
             SettingError: The factor does not exist, or has no room for the point.
         """
         k, d = self.arrays.inverse_squares.shape
@@ -113,11 +117,14 @@ class Window:
         P = -(-N // COLUMNS) * COLUMNS
         data = aligned((d + 3 * k, P))
         arrays = self.arrays._replace(points=data[:d], weights=data[-k:], size=N)
+        new = np.concatenate([point, target, noise])
+        if not np.isfinite(new).all():
+            raise DataError("a point, its targets and their noise must be finite")
         columns = self._columns_to_extend()
         rows = N if rows is None else rows
         positive = _append.unchecked(
             before=self.data,
-            new=np.concatenate([point, target, noise]),
+            new=new,
             data=data,
             gps=arrays,
             columns=columns,

@@ -286,9 +286,9 @@ def _operate_exponential(operation, a):
     if operation == EXPM1:
         return math.expm1(a), math.exp(a), 0.0
     if operation == LOG:
-        return math.log(a) if a > 0.0 else np.nan, _over(1.0, a), 0.0
+        return np.log(a), _over(1.0, a), 0.0
     if operation == LOG1P:
-        return math.log1p(a) if a > -1.0 else np.nan, _over(1.0, 1.0 + a), 0.0
+        return np.log1p(a), _over(1.0, 1.0 + a), 0.0
     return math.erf(a), 2.0 / math.sqrt(math.pi) * math.exp(-a * a), 0.0
 
 
@@ -321,10 +321,10 @@ def _operate_hyperbolic(operation, a):
     if operation == ASINH:
         return math.asinh(a), 1.0 / math.sqrt(1.0 + a * a), 0.0
     if operation == ACOSH:
-        value = math.acosh(a) if a >= 1.0 else np.nan
-        return value, _over(1.0, math.sqrt(max(a * a - 1.0, 0.0))), 0.0
-    value = math.atanh(a) if abs(a) < 1.0 else np.nan
-    return value, _over(1.0, 1.0 - a * a), 0.0
+        if not a >= 1.0:
+            return np.nan, np.nan, 0.0
+        return math.acosh(a), _over(1.0, math.sqrt(a * a - 1.0)), 0.0
+    return np.arctanh(a), _over(1.0, 1.0 - a * a), 0.0
 
 
 @njit_noalloc
@@ -372,12 +372,11 @@ def _operate_on_pair(operation, a, b):
     if operation == HYPOT:
         root = math.hypot(a, b)
         return root, _over(a, root), _over(b, root)
-    if operation == FMIN:
-        by_first = 1.0 if a <= b else 0.0
-        return min(a, b), by_first, 1.0 - by_first
-    if operation == FMAX:
-        by_first = 1.0 if a >= b else 0.0
-        return max(a, b), by_first, 1.0 - by_first
+    if operation in (FMIN, FMAX):
+        takes_first = a <= b if operation == FMIN else a >= b
+        if takes_first or np.isnan(b):  # what is no number limits nothing
+            return a, 1.0, 0.0
+        return b, 0.0, 1.0
     if operation == FMOD:
         value = np.fmod(a, b) if b != 0.0 else np.nan
         return value, 1.0, -np.trunc(_over(a, b))

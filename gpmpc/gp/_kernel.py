@@ -22,13 +22,23 @@ language needs it; a change of the kernel is a change of each, derivatives inclu
 
 (``propagation._moments`` and ``_kernels._gp_moments`` hold its expectations.)
 
+Differences and length-scales are read, without the formula, in
+``_kernels/_gp_point._write_differences``, ``_kernels/_window._write_kernel_row``,
+``mpc/_data_range``, ``mpc/_novelty``, ``export/_points``, ``estimation/_noise`` and
+``testing/_propagator``. ``_kernels.GPArrays`` are made in ``_packed.pack``,
+``Window.empty`` and ``models/_roll_out._compiled_tape``. ``SparseTrainer`` hands its
+settings on to ``Trainer`` in ``_exact_trainer``; ``gp/_gpytorch.to_gpytorch`` makes an
+RBF kernel of any posterior. A kernel that is SE-ARD over sines and cosines, a periodic
+one, is no new kernel: it is what ``models.Features`` makes of an angle.
+
 Its parameters stand elsewhere too: rows theta = (log l, log sf, log(sf / sn)) in
 ``Hyperparameters``, ``gp._search``, ``gp._training_data`` and ``gp._sparse_training``;
 the kernel's name in files, ``gp._storage`` ("SE-ARD", where they are written and read);
 and what ``from_gpytorch`` takes for it, ``gp._gpytorch._check_se_ard``. ``1 / l^2`` and
 log sf2 travel packed (``_kernels.GPArrays``), from which ``learning._changed_model``
 makes a posterior and ``export._models`` tables. Another kernel is refused by name where
-closed forms need this one: ``propagation._moment_matching._exact_form``.
+closed forms need this one: in ``propagation._moment_matching._has_exact_moments`` and
+``_linearization._is_gp_alone``, which look at a model's form alone today.
 """
 
 from typing import Any, NamedTuple

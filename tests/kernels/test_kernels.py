@@ -20,7 +20,7 @@ from gpmpc._kernels._rows import (
     reduce_variances,
 )
 from gpmpc._kernels._simd import NEAR_ZERO, load, store
-from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation._moments import moments, moments_with_jacobian
 from tests.propagation.test_moment_matching import belief, by_mpmath, model
@@ -528,6 +528,17 @@ def test_a_full_window_refuses_a_further_point():
         window = window.append(point, np.zeros(1), np.full(1, 0.1))
     with pytest.raises(SettingError, match="capacity: of 16 points is used up"):
         window.append(np.array([16.0, 0.0]), np.zeros(1), np.full(1, 0.1))
+
+
+@pytest.mark.parametrize("part", range(3))
+def test_a_window_refuses_a_point_that_is_not_finite(part):
+    window = kernels.Window.empty(np.ones((1, 2)), np.ones(1), 1, capacity=16)
+    new = [np.zeros(2), np.zeros(1), np.full(1, 0.1)]
+    new[part][-1] = np.nan
+    with pytest.raises(DataError, match="must be finite"):
+        window.append(*new)
+    new[part][-1] = 0.1
+    assert window.append(*new).rows == 1
 
 
 def test_the_exponentials_keep_the_limits():

@@ -155,3 +155,53 @@ def test_a_function_without_inputs_is_a_model():
     state = torch.ones(3, 2)
     after = model.predict(state, torch.empty(3, 0)).mean
     assert torch.equal(after, 2 * state)
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.float32])
+def test_numbers_of_any_type_are_taken_for_what_they_are(dtype):
+    function = CasadiFunction(FUNCTIONS[0])
+    arguments = (np.array([[1, 2, 3]]), np.array([[1, 2]]))
+    expected = function.linearize(*[a.astype(float) for a in arguments])
+    for value, right in zip(
+        function.linearize(*[a.astype(dtype) for a in arguments]), expected, strict=True
+    ):
+        assert np.array_equal(value, right)
+
+
+POLES = {
+    "log": (casadi.log, 0.0),
+    "log1p": (casadi.log1p, -1.0),
+    "atanh": (casadi.atanh, 1.0),
+    "atanh below": (casadi.atanh, -1.0),
+    "log outside": (casadi.log, -1.0),
+    "log1p outside": (casadi.log1p, -2.0),
+    "acosh outside": (casadi.acosh, 0.5),
+    "a floor": (lambda x: casadi.fmax(-5, casadi.log(x)), 0.0),
+    "a floor under nothing": (lambda x: casadi.fmax(casadi.log(x), -5), -1.0),
+    "a floor under nothing, first": (lambda x: casadi.fmax(-5, casadi.log(x)), -1.0),
+    "a ceiling over nothing": (lambda x: casadi.fmin(casadi.log(x), -5), -1.0),
+}
+
+
+@pytest.mark.parametrize("name", POLES)
+def test_values_at_a_pole_and_outside_are_those_of_casadi(name):
+    make, point = POLES[name]
+    x = casadi.SX.sym("x")
+    function = CasadiFunction(casadi.Function("f", [x], [make(x)]))
+    value, slope = function.linearize(np.array([[point]]))
+    expected = float(function.function(point))
+    assert np.array_equal(value.item(), expected, equal_nan=True)
+    if np.isnan(expected):
+        assert np.isnan(slope).all() or "log" in name  # of which CasADi has 1 / x
+
+
+def test_a_limit_has_the_slope_of_what_it_takes():
+    x = casadi.SX.sym("x")
+    for limit in (
+        casadi.fmax(-5, casadi.log(x)),
+        casadi.fmax(casadi.log(x), -5),
+        casadi.fmin(casadi.log(x), -5),
+    ):
+        function = CasadiFunction(casadi.Function("f", [x], [limit]))
+        values, slopes = function.linearize(np.array([[-1.0]]))
+        assert (values.item(), slopes.item()) == (-5.0, 0.0)
