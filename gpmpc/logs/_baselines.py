@@ -14,7 +14,7 @@ from gpmpc.models._windows import Windows
 CONSTANT_STATE = "constant state"
 #: those that a controller could plan with
 PLANNABLE_BASELINES = (CONSTANT_STATE, "constant velocity", "least squares")
-RIDGE_WINDOWS = 3000  #: to which the ridge regression is fitted
+_RIDGE_WINDOWS = 3000  # to which the ridge regression is fitted
 
 
 def baseline_errors(
@@ -57,7 +57,7 @@ def _ridge_errors(
 ) -> Array:
     """Computes the errors (W, steps, e) of a ridge regression with history."""
     ahead = max(steps)
-    training_windows = train.windows(ahead, PAST, most=RIDGE_WINDOWS)
+    training_windows = train.windows(ahead, PAST, most=_RIDGE_WINDOWS)
     (ridge,) = Correction.fit_each(
         kinematics=kinematics,
         windows=training_windows,

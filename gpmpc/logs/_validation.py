@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from gpmpc.exceptions import DataError
-from gpmpc.logs._baselines import RIDGE_WINDOWS
 from gpmpc.logs._fitting import PAST, NominalFit
 from gpmpc.logs._folds import MANY_RUNS, Fold
 from gpmpc.logs._log import Log
@@ -26,6 +25,7 @@ from gpmpc.models._log_model import LogModel
 from gpmpc.models._windows import Windows
 
 _CORRECTED_WINDOWS = 2400  # that a correction is fitted to
+_WINDOWS_WITHOUT_MODEL = 6000  # likewise, where it needs no rollout of a model
 #: of models of all rows, by those of three quarters and of halves
 _GAIN_EXPONENT = np.log(4 / 3) / np.log(3 / 2)
 #: ranges of a state in the log, by which a rollout that a correction is fitted to may
@@ -241,7 +241,7 @@ class Validations:
         """
         rollouts = {}
         for step in correction_steps(self._steps):
-            windows = part.windows(step, past=PAST, most=RIDGE_WINDOWS)
+            windows = part.windows(step, past=PAST, most=_WINDOWS_WITHOUT_MODEL)
             rows = self._rows_of(windows, part)
             rollouts[step] = Rollouts.of_constant_state(windows, rows)
         return rollouts
