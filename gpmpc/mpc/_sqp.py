@@ -88,8 +88,8 @@ class MeritTerms(NamedTuple):
 class StepForecast(NamedTuple):
     """The promise of the step from a plan to a proposed one."""
 
-    cost: float  # of the plan, with the price of its violated rows
-    promised: float  # likewise of the proposed plan, as the program sees it
+    cost: float  # of the plan, without the price of violated rows
+    promised: float  # of the proposed plan, with that price, as the program sees it
     squared_length: float  # of the step in the metric of the cost
     defect: float  # the largest of the plan, relative to the states
     merit: float  # of the plan, under the new prices of defects
@@ -121,20 +121,20 @@ class Progress(NamedTuple):
     size: float = math.inf  # of the last step
     rate: float = 1.0  # its ratio to the one before
     last_rate: float = 1.0
-    is_first: bool = False  # whether it was the first step
+    steps: int = 0
     creeps: bool = False  # whether steps near the solution became little smaller
 
     def after(self, size: float) -> "Progress":
         """Returns the progress after one more step."""
-        is_first = math.isinf(self.size)
-        rate = 1.0 if is_first or self.size == 0.0 else size / self.size
+        is_later = self.steps > 0
+        rate = size / self.size if is_later and self.size > 0.0 else 1.0
         near = _NOISE < size**2 < _NEAR**2
-        creeps = self.creeps or (near and not is_first and rate > _CREEP)
+        creeps = self.creeps or (near and is_later and rate > _CREEP)
         return Progress(
             size=size,
             rate=rate,
             last_rate=self.rate,
-            is_first=is_first,
+            steps=self.steps + 1,
             creeps=creeps,
         )
 
@@ -143,7 +143,9 @@ class Progress(NamedTuple):
 
         It also has where rounding lets it come no nearer.
         """
-        if self.size**2 <= _NOISE and self.rate * self.last_rate > _STALL:
+        has_two_rates = self.steps > 2
+        stalls = has_two_rates and self.rate * self.last_rate > _STALL
+        if self.size**2 <= _NOISE and stalls:
             return True
         if self.size <= tolerance:
             return True
@@ -157,7 +159,6 @@ def measure_continuity(
     request: Request,
     local: LocalProblem,
     proposed: Plan,
-    row_prices: Array,
 ) -> tuple[bool, float]:
     """Tells whether a step goes on along the last plan, so that one program is enough.
 
@@ -169,9 +170,7 @@ def measure_continuity(
     Returns:
         Whether it does, and the length of the step, squared in the metric of the cost.
     """
-    cost, squared_length = _measure_step.unchecked(
-        local, request.references, row_prices, proposed
-    )
+    cost, squared_length = _measure_step.unchecked(local, request.references, proposed)
     last_lengths = () if request.previous is None else request.previous.steps
     if len(last_lengths) == 0:
         return True, squared_length
@@ -257,7 +256,7 @@ class Globalization:
         )
         self._defect_prices = forecast.defect_prices
         self.squared_length = forecast.squared_length
-        # Rounding may leave a cost that is zero below it.
+        # Prices of violations are no residuals; rounding may leave a zero below it.
         scale = max(forecast.cost, 0.0) + self._cost_floor
         offset = math.sqrt(forecast.squared_length / scale)
         self._progress = self._progress.after(max(offset, forecast.defect))
@@ -271,9 +270,10 @@ class Globalization:
         return self._end_without_step(local, proposed, is_optimum)
 
     def _raise_hard_price(self, multipliers: Array) -> None:
-        """Raises the price of hard rows above their multipliers (H, r)."""
-        if multipliers.size:
-            largest = float(np.abs(multipliers).max())
+        """Raises the price of hard rows above theirs of all multipliers (H, r)."""
+        hard = np.isinf(self._merit_terms.prices)
+        if hard.any():
+            largest = float(np.abs(multipliers[:, hard]).max())
             hard_price = max(self._merit_terms.hard_price, 2.0 * largest)
             self._merit_terms = self._merit_terms._replace(hard_price=hard_price)
 
@@ -346,7 +346,7 @@ class Globalization:
         """
         progress = self._progress
         request = self._request
-        goes_on = progress.is_first and request.continues_last_plan
+        goes_on = progress.steps == 1 and request.continues_last_plan
         far = progress.size > _NEAR and not goes_on
         matches_moments = self._prediction.linearizer.depends_on_covariance
         return matches_moments or progress.creeps or far
@@ -495,10 +495,10 @@ def _priced_cost(cost, terms, rows, plan):
 
 
 @compiled
-def _measure_step(local, references, prices, proposed):
-    """Returns the cost of a plan, violations included, and a step's squared length."""
-    terms = MeritTerms(references, prices, 0.0)
-    cost = _priced_cost(local.cost, terms, local.rows, local.plan)
+def _measure_step(local, references, proposed):
+    """Returns the cost of a plan, violations left out, and a step's squared length."""
+    plan = local.plan
+    cost = evaluate_cost(local.cost, plan.states, plan.inputs, references, 1.0)
     squared_length = _cost_of_step(local.cost, references, local.plan, proposed)
     return cost, squared_length
 
@@ -521,7 +521,10 @@ def _forecast_step(local, terms, defect_prices, proposed, multipliers):
             defects[i] += defect
             largest_defect = max(largest_defect, defect)
             largest_state = max(largest_state, abs(states[k + 1, i]))
-    cost = _priced_cost(local.cost, terms, local.rows, local.plan)
+    cost = evaluate_cost(
+        local.cost, local.plan.states, local.plan.inputs, terms.references, 1.0
+    )
+    priced_cost = _priced_cost(local.cost, terms, local.rows, local.plan)
     promised = _priced_cost(local.cost, terms, local.rows, proposed)
     squared_length = _cost_of_step(local.cost, terms.references, local.plan, proposed)
     targets = terms.references.states
@@ -532,7 +535,7 @@ def _forecast_step(local, terms, defect_prices, proposed, multipliers):
     for k in range(H):
         for i in range(p):
             prices[i] = max(prices[i], 1.5 * abs(costates[k, i]))
-    merit = cost + dot(defects, prices, p)
+    merit = priced_cost + dot(defects, prices, p)
     relative_defect = largest_defect / largest_state
     return StepForecast(cost, promised, squared_length, relative_defect, merit, prices)
 

@@ -849,7 +849,7 @@ class _ControlStep:
         if not (is_first_program and may_stop_after_one):
             return False
         continues, squared_length = measure_continuity(
-            self._prediction, request, local, proposed, self._row_prices
+            self._prediction, request, local, proposed
         )
         if continues:
             self._squared_lengths.append(squared_length)
@@ -911,8 +911,10 @@ class _ControlStep:
             return False
         if status is None or not status.solved:
             return False
-        promised = float(solution.violation().max(initial=0.0))
-        return self._violation(ending) > MISS_RATIO * promised + KEPT
+        missed = ending.row_violations()
+        row_promises = solution.violation()[-missed.size :].reshape(missed.shape)
+        promised = row_promises.max(axis=0)
+        return bool((missed.max(axis=0) > MISS_RATIO * promised + KEPT).any())
 
     def _violation(self, local: LocalProblem) -> float:
         """Returns by how much a plan misses a bound, at most."""
