@@ -170,9 +170,10 @@ def test_a_bound_of_what_the_cost_does_not_weigh_counts():
     assert decision.means[-1, 1] == pytest.approx(1.0, abs=1e-6)
 
 
-def test_a_vehicle_pushed_out_of_its_lane_returns_without_a_spin():
+@pytest.mark.parametrize("iterations", [1, None])
+def test_a_vehicle_pushed_out_of_its_lane_returns_without_a_spin(iterations):
     """A tyre that lets go beyond a slip: what exact bounds ask for is more than it
-    bears."""
+    bears, where programs see it as it is at the plan before."""
 
     def slide(x, u):
         offset, rate, heading = x.unbind(-1)
@@ -201,6 +202,7 @@ def test_a_vehicle_pushed_out_of_its_lane_returns_without_a_spin():
             15,
             [0.0],
             PredictionSettings(covariance="none"),
+            iterations=iterations,
         )
         state = np.array([0.2, 0.0, 0.0])
         decision = None
@@ -215,7 +217,8 @@ def test_a_vehicle_pushed_out_of_its_lane_returns_without_a_spin():
             state = next_state.numpy()
             worst = max(worst, abs(state[0]))
         ends[penalty] = worst
-    assert ends["exact"] > 1.0
+    if iterations == 1:
+        assert ends["exact"] > 1.0
     assert ends["default"] < 1.1 * max(0.2, ends["none"])
 
 
