@@ -846,12 +846,14 @@ static real worst_violation(const gpmpc_program *work)
     for (p = 0; p < constraint_count(work); p++) {
         real above = work->value[p] - work->upper[p];
         real below = work->lower[p] - work->value[p];
-        real bound = above > below ? work->upper[p] : work->lower[p];
-        real size = larger(length * work->norm[p] / 1000, absolute(bound));
-        real violation = larger(above, below);
-        if (!(absolute(work->multiplier[p]) < work->cap[p]))
-            violation = work->multiplier[p] > 0 ? -above : -below;
-        worst = larger(worst, (violation - work->negligible[p]) / size);
+        int at_cap = !(absolute(work->multiplier[p]) < work->cap[p]);
+        int at_upper = at_cap ? work->multiplier[p] > 0 : above > below;
+        real outside_bound = at_upper ? above : below;
+        real excess = (at_cap ? -outside_bound : outside_bound) - work->negligible[p];
+        real bound = at_upper ? work->upper[p] : work->lower[p];
+        if (excess > 0) /* which that of a constraint without bounds is not */
+            worst = larger(worst, excess / larger(length * work->norm[p] / 1000,
+                                                  absolute(bound)));
     }
     return worst;
 }
@@ -994,6 +996,23 @@ static int open_program(gpmpc_program *work, const real *prices)
     return read_bounds(work);
 }
 
+/* The size of the numbers that cancelled in a row of zeros: that of the other bounds,
+   but at most one; one where there are no others. */
+static real zero_row_size(const gpmpc_program *work)
+{
+    real size = 0;
+    int p;
+    for (p = 0; p < constraint_count(work); p++) {
+        if (work->row_end[p] == 0)
+            continue;
+        if (is_finite(work->lower[p]))
+            size = larger(size, absolute(work->lower[p]));
+        if (is_finite(work->upper[p]))
+            size = larger(size, absolute(work->upper[p]));
+    }
+    return size > 0 ? smaller(1, size) : 1;
+}
+
 /* Returns whether the multipliers prove that no x keeps the bounds (Farkas): with
    y'C = 0, up to rounding, sum y+ upper + y- lower < 0. */
 static int proves_infeasibility(gpmpc_program *work, const real *ray)
@@ -1022,6 +1041,8 @@ static int proves_infeasibility(gpmpc_program *work, const real *ray)
             return 0;
         total += repaired * bound;
         sizes += absolute(repaired * bound);
+        if (work->row_end[p] == 0)
+            sizes += absolute(ray[p]) * zero_row_size(work);
     }
     return total < -ROUNDING_OF_SUMS * sizes;
 }

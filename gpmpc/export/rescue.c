@@ -280,6 +280,15 @@ static real terms_of(const gpmpc_program *work, int p)
     return terms;
 }
 
+/* The size of the numbers whose rounding a violation may be. */
+static real rounded_terms_of(const gpmpc_program *work, int p, int side)
+{
+    real bound = side > 0 ? work->upper[p] : work->lower[p];
+    if (work->row_end[p] == 0)
+        return zero_row_size(work);
+    return larger(terms_of(work, p), absolute(bound));
+}
+
 /* Finds the most violated constraint. Returns whether there is one. */
 static int find_violation(const Rescue *rescue, gpmpc_program *work,
                           Violation *violation)
@@ -442,19 +451,16 @@ static int run_rescue(Rescue *rescue, gpmpc_program *work)
             return GPMPC_SOLVED;
         if (rescue->iterations >= iteration_limit(work))
             return GPMPC_ITERATION_LIMIT;
-        rounding = larger(terms_of(work, violation.p),
-                          absolute(violation.side > 0 ? work->upper[violation.p]
-                                                      : work->lower[violation.p]));
-        rounding *= ROUNDING_OF_DATA;
+        rounding = ROUNDING_OF_DATA
+                   * rounded_terms_of(work, violation.p, violation.side);
         if (satisfy_accurately(rescue, work, &violation, rounding))
             continue;
         if (prove_contradiction(rescue, work, &violation))
             return GPMPC_INFEASIBLE;
         for (i = 0; i < rescue->size; i++) {
             int p = constraint_in(work, i);
-            real bound = side_in(work, i) > 0 ? work->upper[p] : work->lower[p];
             rounding += ROUNDING_OF_DATA * absolute(work->direction[i])
-                        * larger(terms_of(work, p), absolute(bound));
+                        * rounded_terms_of(work, p, side_in(work, i));
         }
         if (violation.amount > rounding)
             return GPMPC_NUMERICAL_TROUBLE;

@@ -1,0 +1,37 @@
+"""The quadratic programs of exported C end as those of Python do."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from gpmpc.qp import DualActiveSet, QuadraticProgram
+from gpmpc.status import Status
+from tests.export.programs import CompiledPrograms
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+NONE = np.inf
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    return CompiledPrograms(2, 3)
+
+
+@pytest.mark.parametrize("gap", [1e-6, 1e-8, 1e-10])
+def test_a_row_without_bounds_hides_no_contradiction(compiled, gap):
+    rows = [[1.0, 1.0], [1.0, 1.0], [0.0, 1.0]]
+    lower = [-NONE, 1.0 + gap, -NONE]
+    problem = QuadraticProgram(np.eye(2), [-10, -10], rows, lower, [1.0, NONE, NONE])
+    assert DualActiveSet().solve(problem).status is Status.INFEASIBLE
+    assert compiled.solve(problem).status is Status.INFEASIBLE
+
+
+def test_a_zero_row_proves_infeasibility_beyond_rounding_only(compiled):
+    rows = [[0.0, 0.0], [1.0, 1.0], [0.0, 1.0]]
+    for bound, status in ((-2.2e-16, Status.SOLVED), (-1e-12, Status.INFEASIBLE)):
+        problem = QuadraticProgram(
+            np.eye(2), [-1e-16, 0.0], rows, h_upper=[bound, 1.0, 1.0]
+        )
+        assert DualActiveSet().solve(problem).status is status
+        assert compiled.solve(problem).status is status
