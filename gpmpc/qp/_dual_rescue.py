@@ -442,11 +442,12 @@ def _add(parts: Array, where, change: Array) -> None:
 
     The second holds what the first rounds off.
     """
-    high = parts[0, where]
+    high = parts[0, where]  # may be a view, which the last two lines write to
     low = parts[1, where] + change
     total = high + low
+    remainder = low - (total - high)
     parts[0, where] = total
-    parts[1, where] = low - (total - high)
+    parts[1, where] = remainder
 
 
 def _sum_products(products: list[tuple[Array, Array]], constant: Array) -> Array:

@@ -3,10 +3,13 @@
 ``SOLVED`` is to be true there too.
 """
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 
 from gpmpc.qp import DualActiveSet, QuadraticProgram
+from gpmpc.qp._dual_rescue import _add as add_to_pair
 from gpmpc.status import Status
 
 
@@ -71,3 +74,16 @@ def test_a_multiplier_towards_a_contradiction_is_reset(rng):
         assert (
             solution.multipliers[~working] == 0.0
         ).all() or not solution.status.solved
+
+
+@pytest.mark.parametrize("where", [slice(None), [0, 1]])
+def test_a_sum_of_two_floats_keeps_what_the_first_rounds_off(where):
+    total = np.zeros((2, 2))
+    changes = [[-4.0, 5e-16], [8.9e-16, -3e-17], [2.0**-80, 1e-33]]
+    for change in changes:  # each smaller than what is there, as Newton's are
+        add_to_pair(total, where, np.array(change))
+    for pair, terms in zip(total.T, np.transpose(changes), strict=True):
+        high, low = (Fraction(float(part)) for part in pair)
+        exact = sum(Fraction(float(term)) for term in terms)
+        assert high == Fraction(float(high + low))  # the second is its rounding
+        assert abs(high + low - exact) <= abs(exact) * Fraction(2) ** -100
