@@ -244,7 +244,9 @@ def _find_delimiter(lines: Sequence[str]) -> str:
 def _first_row(lines: Sequence[Fields], delimiter: str) -> int:
     """Finds the first line of values; the one behind the first if none has a number.
 
-    Between white space, sentences have numbers too: rows are as wide as most lines.
+    What an instrument writes above the rows has numbers too. Between white space rows
+    are as wide as most lines; elsewhere their last cells may be missing, but they do
+    not begin with a text where most begin with a number.
     """
     is_numeric = [any(map(_is_number, fields)) for fields in lines]
     widths = Counter(
@@ -253,10 +255,16 @@ def _first_row(lines: Sequence[Fields], delimiter: str) -> int:
         if numeric
     )
     usual_width = widths.most_common(1)[0][0] if widths else 0
+    begins = [_is_text(fields[0]) for fields in lines if len(fields) == usual_width]
+    begin_with_text = sum(begins) > len(begins) / 2
     for index, fields in enumerate(lines):
         is_first = index == 0 and len(lines) > 1
-        is_header = is_first and _names_numbers(fields, lines[1])
-        fits = delimiter != WHITE_SPACE or len(fields) == usual_width
+        is_header = is_first and (
+            _names_numbers(fields, lines[1]) or _counts_columns(fields)
+        )
+        fits = len(fields) == usual_width
+        if delimiter != WHITE_SPACE and not fits:
+            fits = begin_with_text or not _is_text(fields[0])
         if is_numeric[index] and fits and not is_header:
             while index > 0 and not any(lines[index - 1]):  # rows without a value
                 index -= 1
@@ -270,6 +278,15 @@ def _names_numbers(fields: Fields, below: Fields) -> bool:
         _is_text(upper) and any(map(str.isalpha, upper)) and _is_number(lower)
         for upper, lower in zip(fields, below, strict=False)
     )
+
+
+def _counts_columns(fields: Fields) -> bool:
+    """Tells whether a line holds 0, 1, ..., as pandas writes it above nameless columns.
+
+    An empty field stands above the index.
+    """
+    counted = [str(number) for number in range(len(fields) - 1)]
+    return len(counted) > 1 and fields[0] == "" and fields[1:] == counted
 
 
 def _find_header(
@@ -288,6 +305,8 @@ def _find_header(
     """
     if not rows:
         return _Header(_split_line(lines[0], delimiter), skipped=0)
+    if lines and _counts_columns(_split_line(lines[-1], delimiter)):
+        return _Header([], skipped=len(lines))  # other numbers than a mapping counts by
     for separators in ((delimiter,), DELIMITERS):
         names = _last_names(lines[-_HEADER:], rows, separators)
         if names:

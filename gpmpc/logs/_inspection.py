@@ -6,7 +6,6 @@ is read as well: an input of which the states explain most of the variance, line
 teaches nothing of its own.
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,24 +37,18 @@ from gpmpc.logs._formats import read_file
 from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._read_log import read_log
-from gpmpc.logs._row_times import row_times
+from gpmpc.logs._row_times import read_dates, row_times, unit_in_name
 from gpmpc.logs._runs import split_into_runs
 from gpmpc.logs._signals import holds_times, read_column
+from gpmpc.logs._time_step import JITTER
 
 # columns that hold the time where nobody says which
 TIMES = (STAMP, "timestamp", "t", "time", "stamp", "Time", "seconds")
-# and those whose names say the unit: "Time [ms]", "time (us)", "t_s"; TimeUS is
-# ArduPilot's
-_TIME_WITH_UNIT = re.compile(
-    r"(?:[Tt]ime|[Tt]imestamp|t)(?: ?[\[(](s|ms|us|ns)[\])]|_(s|ms|us|ns))"
-)
-_TIME_US = "TimeUS"
 EVEN = 1e-3  # of its step: a column that rises as evenly may be the time
 DRAWN = 3000  # points of a channel's line
 MOST_DELAYS = 20  # that are listed
 FOLLOWS = 0.95  # share of an input's variance that the states explain
 GAP = 1.5  # time steps between two rows, from which on rows are missing
-JITTER = 0.1  # of the time step, from which on a rate should be stated
 
 
 @dataclass(frozen=True)
@@ -377,7 +370,7 @@ def _times_of(
     if time_step is not None:
         return _Times(np.arange(len(table), dtype=float) * time_step)
     named = mapping.time if mapping is not None else time
-    unit = mapping.time_unit if mapping is not None else "s"
+    unit = mapping.time_unit if mapping is not None else ""
     number = column_number(table, named)
     if number:
         named = str(table.columns[number - 1])
@@ -392,7 +385,11 @@ def _times_of(
         return _Times(np.arange(len(table), dtype=float), are_rows=True)
     if holds_times(table, named):
         return _Times(read_column(str(path), table, named), column=named)
+    dates = read_dates(table, named)
+    if dates is not None:
+        return _Times(dates, column=named)
     stamps = pd.to_numeric(table[named], errors="coerce").to_numpy(float)
+    unit = unit or unit_in_name(named) or "s"
     return _Times(stamps * TIME_UNITS[unit], column=named)
 
 
@@ -402,11 +399,9 @@ def _usual_time_column(table: pd.DataFrame) -> tuple[str, str]:
         if name in table:
             return name, "s"
     for name in table:
-        match = _TIME_WITH_UNIT.fullmatch(str(name))
-        if match is not None:
-            return name, match[1] or match[2]
-        if name == _TIME_US:
-            return name, "us"
+        unit = unit_in_name(str(name))
+        if unit:
+            return name, unit
     return "", "s"
 
 
@@ -481,8 +476,9 @@ def _stream_warnings(
         if count:
             warnings.append(f"{count} {kind}{of_topic}")
     if len(clock.time) < 2:
+        held = "a single stamp" if len(clock.time) else "no stamp"
         warnings.append(
-            f"the time{of_topic} holds a single stamp: values stand over their rows"
+            f"the time{of_topic} holds {held}: values stand over their rows"
         )
     if steps.gaps:
         warnings.append(

@@ -4,6 +4,7 @@ A mapping is a YAML file or a dictionary (docs/guide_log.md). It names units, fr
 conventions; states come out in m, rad, s, kg and their products.
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -36,6 +37,8 @@ _PLAIN_KEYS = (  # whose values are taken as they are
     "model",
     "stamp",
 )
+# a column that is called as one of the four, such as "qw", "q_x", "orientation.y"
+_QUATERNION_ENTRY = re.compile(r"(?:.*[^A-Za-z])?[Qq]?([WXYZwxyz])")
 _AXES_KEY = "frame"  # as files call the axes of all states
 _SIGNAL_KEYS = (
     "columns",
@@ -86,6 +89,7 @@ class Signal:
     def __post_init__(self) -> None:
         self._check_choices()
         self._check_columns()
+        self._check_order()
         self._check_number_or_numbers("scale")
         self._check_number_or_numbers("delay")
         self._check_delay()
@@ -110,6 +114,19 @@ class Signal:
             raise SettingError(
                 f"{self._key}.columns",
                 f"must be {number or 1} names of columns; got {list(self.columns)}",
+            )
+
+    def _check_order(self) -> None:
+        """Raises ``SettingError`` where the columns' names contradict the order."""
+        if self.kind != "quaternion":
+            return
+        matches = [_QUATERNION_ENTRY.fullmatch(column) for column in self.columns]
+        named = "".join(match[1] for match in matches if match is not None).lower()
+        if set(named) == set("wxyz") and named != self.order:
+            raise SettingError(
+                f"{self._key}.order",
+                f"must be that of the columns {', '.join(self.columns)} "
+                f"(order: xyzw or wxyz); got {self.order}",
             )
 
     def _check_number_or_numbers(self, name: str) -> None:
@@ -223,7 +240,8 @@ class LogMapping:
 
     signals: tuple[Signal, ...]  #: states, inputs and context, in this order
     time: str = ""  #: column of the stamps; empty takes the stamps of the messages
-    time_unit: str = "s"  #: of that column
+    #: of that column; empty takes what its name says, as ``t_ms`` does, or s
+    time_unit: str = ""
     #: the constant step of rows without stamps [s], or the column that holds it as its
     #: only number
     time_step: float | str | None = None
@@ -241,7 +259,7 @@ class LogMapping:
     #: ranges (lowest, highest) of columns; rows outside are left out.
     keep: dict[str, tuple[float, float]] = field(default_factory=dict)
     #: "drop" leaves out rows in which a state's whole signal repeats the row before;
-    #: "use" takes them.
+    #: "use" takes them, and zeros of all states at once.
     held: str = "drop"
     #: "drop" leaves out parts in which nothing moves; "use" takes them
     rest: str = "drop"
@@ -280,7 +298,8 @@ class LogMapping:
             raise SettingError(
                 _AXES_KEY, f"needs model: rigid_body; got {self.axes} without one"
             )
-        check_choice("time.unit", self.time_unit, tuple(TIME_UNITS))
+        if self.time_unit:
+            check_choice("time.unit", self.time_unit, tuple(TIME_UNITS))
         if not self.of("states"):
             raise SettingError("states", "must name at least one signal; got none")
         self._check_topics()
@@ -482,7 +501,7 @@ class LogMapping:
         return cls(
             signals=tuple(signals),
             time=_as_name(time.get("column", "")),
-            time_unit=time.get("unit", "s"),
+            time_unit=time.get("unit", ""),
             time_step=time.get("step"),
             names=_read_names("names", content.get("names") or ()),
             run=_as_name(content.get("run", "")),

@@ -34,12 +34,26 @@ class _DeclaredArray(NamedTuple):
         return len(self.shape) in (1, 2) and self.dtype.kind in "biufSU"
 
     @property
+    def is_row(self) -> bool:
+        """Whether it is one row of several values."""
+        return len(self.shape) == 2 and self.shape[0] == 1 and self.shape[1] > 1
+
+    @property
+    def columns(self) -> int:
+        """Number of columns that it becomes."""
+        return 1 if self.is_row else math.prod(self.shape[1:])
+
+    @property
     def is_number(self) -> bool:
         return self.dtype.kind in "biuf"
 
 
 def read_npz(path: Path, options: ReadOptions) -> LogFile:
-    """Reads the arrays of an archive as the columns of one table."""
+    """Reads the arrays of an archive as the columns of one table.
+
+    An array has its columns side by side. One of a single row is a column: those of
+    MATLAB are row vectors.
+    """
     declared = _declared_arrays(path)
     tables = {name: array for name, array in declared.items() if array.is_table}
     _take_memory(path, tables)
@@ -47,6 +61,9 @@ def read_npz(path: Path, options: ReadOptions) -> LogFile:
     with np.load(path, allow_pickle=False) as archive:
         for name, array in tables.items():
             values = np.atleast_1d(archive[name])
+            if array.is_row:
+                columns[name] = values[0]
+                continue
             if len(array.shape) < 2:
                 columns[name] = values
                 continue
@@ -59,9 +76,7 @@ def read_npz(path: Path, options: ReadOptions) -> LogFile:
 def _take_memory(path: Path, tables: dict[str, _DeclaredArray]) -> None:
     """Counts what arrays take before they are read."""
     budget = MemoryBudget(path)
-    check_column_count(
-        path, sum(math.prod(array.shape[1:]) for array in tables.values())
-    )
+    check_column_count(path, sum(array.columns for array in tables.values()))
     for name, array in tables.items():
         bytes_per_cell = NUMBER_BYTES
         if not array.is_number:

@@ -20,10 +20,10 @@ from gpmpc.logs._log import Log, LogRun
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._run_tables import RunTable, tabulate
 from gpmpc.logs._runs import split_into_runs
+from gpmpc.logs._time_step import find_time_step
 from gpmpc.logs._usable_rows import least_motion, select_rows
 
-SHORTEST_STEP = 1e-5  # [s] of rows that are measured one by one
-LONGEST_STEP = 3600.0  # [s] likewise
+MOST_UNLIKE_SPREAD = 30.0  # of two entries of one signal
 
 
 @explains_arguments
@@ -65,7 +65,7 @@ def read_log(
     mapping = with_axes_of_files(_as_mapping(mapping), paths)
     findings: list[Finding] = []
     tables = _read_run_tables(paths, mapping, partial, findings)
-    step = _time_step(tables, paths[0], mapping, findings)
+    step = find_time_step(tables, paths[0], mapping, findings)
     least = least_motion([mapping.split(table.values).states for table in tables], step)
     runs = []
     for table in tables:
@@ -74,6 +74,7 @@ def read_log(
         if run is not None:
             runs.append(run)
     _check_content(runs, paths, findings)
+    _note_unlike_entries(runs, mapping, findings)
     if mapping.model == "rigid_body":
         runs, remarks = read_rigid_bodies(runs, step, mapping)
         findings += remarks
@@ -127,26 +128,35 @@ def _read_run_tables(
     return list(tables.values())
 
 
-def _time_step(
-    tables: Sequence[RunTable],
-    first_path: Path,
-    mapping: LogMapping,
-    findings: list[Finding],
-) -> float:
-    """Returns the time step [s] of a log: its rate's, or the usual one of its rows."""
-    steps = np.concatenate([np.diff(table.time) for table in tables])
-    if not len(steps):
-        reason = "no two rows have different stamps"
-        if mapping.rate:
-            reason = f"a rate of {mapping.rate:g} Hz leaves a single row"
-        raise DataError(f"{first_path}: {reason}")
-    if mapping.rate:
-        return 1 / mapping.rate
-    step = float(np.median(steps))
-    if not SHORTEST_STEP <= step <= LONGEST_STEP:
-        text = f"rows are {step:.3g} s apart: is the unit of the time right?"
-        findings.append(Finding("time step", tables[0].name, 1, text))
-    return step
+def _note_unlike_entries(
+    runs: Sequence[LogRun], mapping: LogMapping, findings: list[Finding]
+) -> None:
+    """Notes signals of the states that hold quantities of unlike size.
+
+    The error of a signal is the length of the errors of its entries, so that the small
+    ones do not count.
+    """
+    if mapping.model != "none":
+        return
+    states = np.concatenate([run.states for run in runs])
+    spreads = states.std(axis=0)
+    for signal, columns in zip(
+        mapping.of("states"), mapping.space.columns, strict=True
+    ):
+        spread = spreads[columns]
+        moving = spread[spread > 0]
+        if signal.is_attitude or len(moving) < 2:
+            continue
+        if moving.max() <= MOST_UNLIKE_SPREAD * moving.min():
+            continue
+        small = signal.columns[int(np.where(spread > 0, spread, np.inf).argmin())]
+        large = signal.columns[int(spread.argmax())]
+        text = (
+            f"{signal.name}: {large} varies by {spread.max():.3g}, {small} by "
+            f"{moving.min():.3g}, and the errors of a signal count together: {small} "
+            "hardly counts; name a signal for each quantity"
+        )
+        findings.append(Finding("unlike entries", runs[0].name, len(states), text))
 
 
 def _check_content(

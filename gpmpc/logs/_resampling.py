@@ -24,6 +24,7 @@ from gpmpc.models._quaternions import (
 )
 
 STAMP_RESOLUTION = 1e-6  # [s]: float64 seconds since 1970 resolve a quarter of it
+FINE_RESOLUTION = 0.1  # of the usual step between samples, where that is less
 COPIES = 2  # of a grid's values, while signals are put on it
 
 
@@ -70,7 +71,7 @@ def grid_at_rate(
         DataError: The grid would be too large.
     """
     steps = (pieces[:, 1] - pieces[:, 0]) * rate * (1 + 1e-12)
-    resolution_in_steps = min(STAMP_RESOLUTION * rate, 0.1)
+    resolution_in_steps = min(STAMP_RESOLUTION * rate, FINE_RESOLUTION)
     lengths = np.floor(steps + resolution_in_steps) + 1
     rows = float(lengths.sum())
     what = f"{rows:.6g} rows of {columns} columns at a rate of {rate:g} Hz"
@@ -200,7 +201,11 @@ def resample(samples: Samples, grid: Array, interpolation: Interpolation) -> Arr
     values = samples.values[present]
     if not len(time):
         return np.full((len(grid), values.shape[1]), np.nan)
-    sample = np.searchsorted(time, grid + STAMP_RESOLUTION, side="right") - 1
+    resolution = STAMP_RESOLUTION
+    if len(time) > 1:
+        usual_step = float(np.median(np.diff(time)))
+        resolution = min(resolution, FINE_RESOLUTION * usual_step)
+    sample = np.searchsorted(time, grid + resolution, side="right") - 1
     before = np.clip(sample, 0, None)
     after = np.clip(sample + 1, None, len(time) - 1)
     lag = grid - time[before]
@@ -219,7 +224,7 @@ def resample(samples: Samples, grid: Array, interpolation: Interpolation) -> Arr
         resampled = start + fraction * wrap(end - start)
     else:
         resampled = start + fraction * (end - start)
-    is_on_sample = lag <= STAMP_RESOLUTION
+    is_on_sample = lag <= resolution
     is_between = (sample < len(time) - 1) & (span <= interpolation.max_gap)
     usable = (sample >= 0) & (is_on_sample | is_between)
     return np.where(usable[:, None], resampled, np.nan)

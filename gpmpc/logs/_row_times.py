@@ -1,5 +1,7 @@
 """Makes the times of rows: of their stamps, or of a constant step without stamps."""
 
+import re
+
 import numpy as np
 import pandas as pd
 
@@ -7,7 +9,27 @@ from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
 from gpmpc.logs._file import STAMP
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
-from gpmpc.logs._signals import holds_times, read_column
+from gpmpc.logs._signals import holds_times, read_column, seconds
+
+LONGEST_UNSTATED = 3600.0  # [s] between rows whose stamps nobody gave a unit
+# names of times that say their unit: "Time [ms]", "time (us)", "t_s"; TimeUS is
+# ArduPilot's
+_TIME_WITH_UNIT = re.compile(
+    r"(?:[Tt]ime|[Tt]imestamp|t)(?: ?[\[(](s|ms|us|ns)[\])]|_(s|ms|us|ns))"
+)
+_TIME_US = "TimeUS"
+
+
+def unit_in_name(column: str) -> str:
+    """Returns the unit that the name of a column of times says; empty for none.
+
+    >>> unit_in_name("t_ms"), unit_in_name("time [us]"), unit_in_name("t")
+    ('ms', 'us', '')
+    """
+    if column == _TIME_US:
+        return "us"
+    match = _TIME_WITH_UNIT.fullmatch(column)
+    return (match[1] or match[2]) if match is not None else ""
 
 
 def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array:
@@ -17,15 +39,58 @@ def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array
         where: Names the table, for errors.
         table: Whose rows they are.
         column: That holds them.
-        unit: Of numbers; dates and durations have their own.
+        unit: Of numbers; dates and durations have their own. Where it is empty, it is
+            what the column's name says, or s.
 
     Raises:
-        DataError: The column is missing, or holds something else.
+        DataError: The column is missing, or holds something else, or rows are hours
+            apart in a unit that nobody stated.
     """
-    times = read_column(where, table, column)
+    dates = read_dates(table, column) if column in table else None
+    if dates is not None:
+        return dates
+    try:
+        times = read_column(where, table, column)
+    except DataError as error:
+        hint = (
+            "dates are read where they are written as 2024-05-01 12:00:00.0; else say "
+            "time: {step: SECONDS} where rows are equally far apart"
+        )
+        raise DataError(f"{error}; {hint}") from error
     if holds_times(table, column):
         return times
-    return times * TIME_UNITS[unit]
+    stated = unit or unit_in_name(column)
+    times = times * TIME_UNITS[stated or "s"]
+    if not stated:
+        _check_unstated_unit(where, times, column)
+    return times
+
+
+def _check_unstated_unit(where: str, times: Array, column: str) -> None:
+    """Raises ``DataError`` of times (K,) [s] that are rather of a smaller unit."""
+    steps = np.diff(times[np.isfinite(times)])
+    if not len(steps) or np.median(steps) <= LONGEST_UNSTATED:
+        return
+    raise DataError(
+        f"{where}: rows are {np.median(steps):.3g} s apart if {column} is in s: in "
+        f"which unit is it? (time: {{column: {column}, unit: us}}, or s, ms, ns)"
+    )
+
+
+def read_dates(table: pd.DataFrame, column: str) -> Array | None:
+    """Reads dates (K,) [s] since 1970 that are texts, such as 2024-05-01 12:00:00.
+
+    They are in ISO's format alone: in others, the day and the month may be confused.
+    Returns None where the column holds anything else.
+    """
+    texts = table[column]
+    if texts.dtype.kind in "biufmM" or pd.to_numeric(texts, errors="coerce").any():
+        return None
+    dates = pd.to_datetime(texts, format="ISO8601", utc=True, errors="coerce")
+    is_wrong = dates.isna() & ~texts.isna()
+    if is_wrong.any() or dates.isna().all():
+        return None
+    return seconds(dates)
 
 
 def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | None:
@@ -46,7 +111,8 @@ def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | N
     if isinstance(step, str):
         step = _only_number(where, table, step)
     if step is not None:
-        return _steps_from_first(table) * step * TIME_UNITS[mapping.time_unit]
+        unit = TIME_UNITS[mapping.time_unit or "s"]
+        return _steps_from_first(table) * step * unit
     if mapping.rate and STAMP not in table and "timestamp" not in table:
         return _steps_from_first(table) / mapping.rate
     return None

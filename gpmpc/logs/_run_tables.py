@@ -31,6 +31,7 @@ from gpmpc.logs._resampling import (
 from gpmpc.logs._row_times import read_times, row_times
 from gpmpc.logs._signals import nan_zero_dropouts, read_column, read_signal
 
+MANY_REPEATS = 0.2  # of the rows that stay: stamps that are rounded repeat as often
 USUAL_GAP = 1.5  # time steps; a longer one is a gap where the mapping names none
 
 
@@ -79,9 +80,11 @@ def tabulate(
     columns = []
     for signal in mapping.signals:
         topic = topics[signal.topic]
-        values = read_signal(topic.where, topic.table, signal, findings)
+        is_kept = _kept_rows(topic, mapping)
+        values = read_signal(topic.where, topic.table, signal, findings, is_kept)
         samples = Samples(topic.stamps.time, values)
         columns.append(_signal_on_grid(samples, grid, signal, mapping))
+        _note_own_rate(samples, grid, signal, mapping, findings)
     return RunTable(
         name=findings.run,
         time=grid.time,
@@ -104,10 +107,18 @@ def _read_topic(
     table = _stamped_rows(topic, table, findings)
     hint = ORDER_TOPICS if topic else ORDER_ROWS
     times = _read_time(topic, where, table, mapping)
+    has_time = np.isfinite(times)
+    if has_time.any() and not has_time.all():
+        count = int((~has_time).sum())
+        findings.add("no stamp", count, f"{count} rows without a time: left out")
+        table = table[has_time]
+        times = times[has_time]
     stamps = ordered_stamps(times, where, hint)
     signals = [signal for signal in mapping.signals if signal.topic == topic]
     ordered = table.iloc[stamps.rows]
-    measured = nan_zero_dropouts(where, ordered, signals, findings)
+    measured = ordered
+    if any((signal.held or mapping.held) != "use" for signal in signals):
+        measured = nan_zero_dropouts(where, ordered, signals, findings)
     _note_stamps(topic, stamps, mapping, findings)
     return _Topic(where=where, table=measured, stamps=stamps)
 
@@ -142,7 +153,7 @@ def _read_time(
             f"{where}: the mapping names no column of stamps (time: NAME) and no "
             "constant step of the rows (time: {step: 0.1})"
         )
-    if topic and mapping.time_unit != "s":
+    if topic and mapping.time_unit not in ("", "s"):
         raise SettingError(
             "time.unit",
             "needs the column that it is of: the stamps of messages are in s; got "
@@ -157,7 +168,7 @@ def _note_stamps(
     """Notes what was wrong with the stamps of a topic."""
     of_topic = f" of {topic}" if topic else ""
     for kind, count, remedy in (
-        ("repeated stamp", stamps.repeated, "left out"),
+        ("repeated stamp", stamps.repeated, _remedy_of_repeats(stamps)),
         ("stamp runs backwards", stamps.backwards, "left out"),
         ("rows out of order", stamps.disordered, "sorted by their stamps"),
     ):
@@ -171,6 +182,16 @@ def _note_stamps(
             "rows on both sides are used"
         )
         findings.add("jump", len(jumps), text)
+
+
+def _remedy_of_repeats(stamps: Stamps) -> str:
+    """Says what becomes of rows whose stamps repeat, and what to do of many."""
+    if stamps.repeated < MANY_REPEATS * len(stamps.time):
+        return "left out"
+    return (
+        "left out; are the stamps rounded? Of rows at equal steps, "
+        "time: {step: SECONDS} in place of the column takes all"
+    )
 
 
 def _make_grid(
@@ -215,6 +236,30 @@ def _signal_on_grid(
     return np.concatenate(columns, axis=1)
 
 
+def _note_own_rate(
+    samples: Samples,
+    grid: Grid,
+    signal: Signal,
+    mapping: LogMapping,
+    findings: RunFindings,
+) -> None:
+    """Notes a state that is measured less often than rows are made of it."""
+    present = np.isfinite(samples.values).all(axis=1)
+    steps = np.diff(samples.time[present])
+    if mapping.rate is None or signal.role != "states" or not len(steps):
+        return
+    own_step = float(np.median(steps))
+    if own_step * mapping.rate < USUAL_GAP or signal.rule == "hold":
+        return
+    share = 1 - 1 / (own_step * mapping.rate)
+    text = (
+        f"{signal.name} is measured at {1 / own_step:.3g} Hz: about {share:.0%} of its "
+        "rows lie between two measurements, and hold something of the later one, so "
+        "predictions look better than they are; state a lower rate"
+    )
+    findings.add("interpolated", int(share * len(grid.time)), text)
+
+
 def _rows_outside(
     where: str, topics: Mapping[str, _Topic], grid: Grid, mapping: LogMapping
 ) -> np.ndarray:
@@ -240,6 +285,16 @@ def _rows_outside(
         for topic in topics_with_column:
             outside |= _rows_outside_of(topic, column, limits, grid, mapping)
     return outside
+
+
+def _kept_rows(topic: _Topic, mapping: LogMapping) -> np.ndarray:
+    """Finds the rows (K,) of a topic inside the ranges of ``keep`` that it holds."""
+    is_kept = np.ones(len(topic.table), dtype=bool)
+    for column, (low, high) in mapping.keep.items():
+        if column in topic.table:
+            values = read_column(topic.where, topic.table, column)
+            is_kept &= (values >= low) & (values <= high)
+    return is_kept
 
 
 def _rows_outside_of(

@@ -21,6 +21,7 @@ from gpmpc.logs._mapping import Signal
 
 LARGEST_ANGLE = 4 * np.pi  # [rad]; larger ones count turns, or are degrees
 FEWEST_JUMPS = 2  # by more than half a turn: a gap may make one
+NO_ATTITUDE = 1e-6  # norm: what an estimator writes before it has begun
 NORM_TOLERANCE = 0.05  # of unit quaternions
 
 
@@ -38,7 +39,7 @@ def read_column(where: str, table: pd.DataFrame, column: str) -> Array:
     check_column(where, table, column)
     values = table[column]
     if holds_times(table, column):
-        return _seconds(values)
+        return seconds(values)
     numbers = pd.to_numeric(values, errors="coerce").to_numpy(dtype=float)
     is_wrong = np.isnan(numbers) & ~values.isna().to_numpy()
     if is_wrong.any():
@@ -55,7 +56,7 @@ def holds_times(table: pd.DataFrame, column: str) -> bool:
     return table[column].dtype.kind in "mM"
 
 
-def _seconds(times: pd.Series) -> Array:
+def seconds(times: pd.Series) -> Array:
     """Returns dates, since 1970, or durations (K,) in seconds; NaN for none."""
     if isinstance(times.dtype, pd.DatetimeTZDtype):
         times = times.dt.tz_convert(None)
@@ -90,7 +91,11 @@ def nan_zero_dropouts(
 
 
 def read_signal(
-    where: str, table: pd.DataFrame, signal: Signal, findings: RunFindings
+    where: str,
+    table: pd.DataFrame,
+    signal: Signal,
+    findings: RunFindings,
+    is_kept: np.ndarray,
 ) -> Array:
     """Reads a signal (K, c) in the units and conventions of ``gpmpc.logs``.
 
@@ -99,6 +104,7 @@ def read_signal(
         table: With K rows.
         signal: Says which columns, and in which units.
         findings: Takes what is missing.
+        is_kept: Rows (K,) that will not be left out: no other has to be right.
 
     Raises:
         DataError: A column cannot be read, angles are rather in degrees, or quaternions
@@ -114,7 +120,7 @@ def read_signal(
     text = f"{absent.sum()} samples of {signal.name} hold no value"
     findings.add("empty sample", absent.sum(), text)
     if signal.kind == "quaternion":
-        return _unit_quaternions(where, values, signal, findings)
+        return _unit_quaternions(where, values, signal, findings, is_kept)
     _check_angles(where, values, signal, findings)
     if signal.kind == "euler":
         return _euler_to_quaternions(values, present=~absent)
@@ -168,19 +174,28 @@ def _euler_to_quaternions(angles: Array, present: np.ndarray) -> Array:
 
 
 def _unit_quaternions(
-    where: str, values: Array, signal: Signal, findings: RunFindings
+    where: str,
+    values: Array,
+    signal: Signal,
+    findings: RunFindings,
+    is_kept: np.ndarray,
 ) -> Array:
-    """Makes unit quaternions (x, y, z, w) whose sign does not flip."""
+    """Makes unit quaternions (x, y, z, w) whose sign does not flip; NaN for none."""
     if signal.order == "wxyz":
         values = values[:, [1, 2, 3, 0]]
     norms = np.linalg.norm(values, axis=1)
+    is_empty = norms < NO_ATTITUDE
+    text = f"{is_empty.sum()} samples of {signal.name} are zeros, no attitude: left out"
+    findings.add("empty sample", is_empty.sum(), text)
     is_off = np.abs(norms - 1) > NORM_TOLERANCE
-    if is_off.any():
-        row = int(np.argmax(is_off))
+    is_wrong = is_off & is_kept & ~is_empty
+    if is_wrong.any():
+        row = int(np.argmax(is_wrong))
         raise DataError(
             f"{where}: {signal.name} in row {row + 1} has norm {norms[row]:.4g}; "
             "expected unit quaternions"
         )
+    norms[is_off] = np.nan
     steady = _with_steady_signs(values / norms[:, None])
     text = f"{steady.flips} times: turned back"
     findings.add("quaternion flips its sign", steady.flips, text)

@@ -8,12 +8,7 @@ begins.
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.ndimage import (
-    binary_dilation,
-    maximum_filter1d,
-    minimum_filter1d,
-    uniform_filter1d,
-)
+from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
@@ -23,6 +18,7 @@ from gpmpc.logs._findings import RunFindings
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._run_tables import RunTable
+from gpmpc.logs._time_step import LONG_STEP, SHORT_STEP
 
 REST_TIME = 0.5  # [s] for which nothing moves at rest
 REST_SHARE = 0.1  # of a state's usual motion that counts as no movement
@@ -31,8 +27,6 @@ USUAL_MOTION = 0.9  # quantile of the ranges within ``REST_TIME``
 # half the rate; clocks that drift make it a little less.
 MOST_HELD = 0.45
 MOST_MISSING = 0.5  # of the rows within ``REST_TIME``: of fewer a range says nothing
-SHORT_STEP = 0.5  # time steps; a shorter one is uneven
-LONG_STEP = 1.5  # time steps likewise
 
 
 def least_motion(states: Sequence[Array], step: float) -> Array:
@@ -87,7 +81,8 @@ def select_rows(
     rows.leave_out(table.outside, "outside of keep", "outside the ranges of keep")
     if mapping.rest == "drop":
         at_rest = _at_rest(values.states, values.inputs, least, step)
-        rows.leave_out(at_rest, "at rest", "where nothing moves")
+        text = "where nothing moves (rest: use keeps them)"
+        rows.leave_out(at_rest, "at rest", text)
     is_missing = np.asarray(np.isnan(table.values).any(axis=1))
     rows.leave_out(is_missing, "missing value", "in a gap or without a value")
     _leave_out_held_values(rows, table.name, values.states, mapping)
@@ -255,7 +250,10 @@ def _at_rest(states: Array, inputs: Array, least: Array, step: float) -> np.ndar
     limit = np.concatenate([least, np.zeros(inputs.shape[1])])
     values = np.concatenate([states, inputs], axis=1)
     is_still = (_range_within(values, size) <= limit).all(axis=1)
-    return binary_dilation(is_still, np.ones(2 * (size // 2) + 1))
+    # A maximum takes the same time for any size, a dilation by the rows of one second
+    # of a fast plant minutes.
+    around = 2 * (size // 2) + 1
+    return maximum_filter1d(is_still.astype(np.uint8), around, mode="constant") > 0
 
 
 def _range_within(values: Array, size: int) -> Array:

@@ -1,0 +1,237 @@
+"""Logs that could be taken for what they are not are refused, noted or read right."""
+
+import numpy as np
+import pandas
+import pytest
+
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.logs import LogMapping, inspect_log, read_log
+
+MAPPING = {"time": "t", "states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
+
+
+def table_of(rows=300, step=0.1):
+    k = np.arange(rows)
+    return pandas.DataFrame(
+        {"t": step * k, "x": np.sin(0.07 * k), "u": np.cos(0.05 * k)}
+    )
+
+
+def written(folder, table, name="log.csv"):
+    table.to_csv(folder / name, index=False)
+    return folder / name
+
+
+def texts(log, kind):
+    return [finding.text for finding in log.findings if finding.kind == kind]
+
+
+@pytest.mark.parametrize("step", [0.14, 0.2])
+def test_runs_of_unlike_steps_are_refused(tmp_path, step):
+    files = [
+        written(tmp_path, table_of(2000), "a.csv"),
+        written(tmp_path, table_of(800, step), "b.csv"),
+    ]
+    rule = f"run b: rows are {step} s apart, those of other runs 0.1 s.*rate: "
+    with pytest.raises(DataError, match=rule + f"{1 / step:.3g}"):
+        read_log(files, MAPPING)
+    log = read_log(files, {**MAPPING, "rate": 1 / step})
+    assert len(log.runs) == 2
+    assert log.time_step == pytest.approx(step)
+
+
+def test_steps_that_a_column_says_are_compared_as_well(tmp_path):
+    files = []
+    for name, step in (("a", 0.1), ("b", 0.14)):
+        table = table_of().drop(columns="t").assign(Ts=step)
+        files.append(written(tmp_path, table, f"{name}.csv"))
+    with pytest.raises(DataError, match="a log has one time step"):
+        read_log(files, {**MAPPING, "time": {"step": "Ts"}})
+
+
+def test_rounded_stamps_of_one_clock_are_like_steps(tmp_path):
+    files = []
+    for name, begin in (("a", 0.0), ("b", 0.017)):
+        table = table_of(401, 0.025)
+        stamps = np.round(begin + table["t"] + 1e-9, 2)
+        files.append(written(tmp_path, table.assign(t=stamps), f"{name}.csv"))
+    assert len(read_log(files, MAPPING).runs) == 2
+
+
+def test_steps_that_vary_are_noted(tmp_path):
+    table = table_of(step=0.01)
+    table["t"] += np.random.default_rng(0).uniform(-0.002, 0.002, 300)
+    (text,) = texts(read_log(written(tmp_path, table), MAPPING), "jitter")
+    assert text.startswith("steps from row to row vary by 18% of the time step")
+    assert text.endswith("s each (a rate resamples)")
+    even = read_log(written(tmp_path, table_of()), MAPPING)
+    assert not texts(even, "jitter")
+
+
+def test_a_state_measured_less_often_than_the_rate_is_noted(tmp_path):
+    table = table_of(2000, 0.01)
+    table["x"] = table["x"].where(np.arange(2000) % 20 == 0)
+    log = read_log(written(tmp_path, table), {**MAPPING, "rate": 100, "max_gap": 0.3})
+    (text,) = texts(log, "interpolated")
+    assert text.startswith("x is measured at 5 Hz: about 95% of its rows")
+    slow = read_log(tmp_path / "log.csv", {**MAPPING, "rate": 5, "max_gap": 0.3})
+    assert not texts(slow, "interpolated")
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"), [("t_ms", 1e3), ("time (us)", 1e6), ("TimeUS", 1e6)]
+)
+def test_the_name_of_a_time_says_its_unit(tmp_path, name, factor):
+    table = table_of().rename(columns={"t": name})
+    table[name] *= factor
+    path = written(tmp_path, table)
+    assert read_log(path, {**MAPPING, "time": name}).time_step == pytest.approx(0.1)
+    rates = inspect_log(path, time=name).streams["rate [Hz]"]
+    assert rates[0] == pytest.approx(10)
+
+
+def test_microseconds_that_nobody_stated_are_refused(tmp_path):
+    table = table_of(step=0.004).rename(columns={"t": "timestamp"})
+    table["timestamp"] = (1e6 * table["timestamp"]).round().astype(int)
+    path = written(tmp_path, table)
+    mapping = {key: MAPPING[key] for key in ("states", "inputs")}
+    with pytest.raises(DataError, match="rows are 4e.03 s apart if timestamp is in s"):
+        read_log(path, mapping)
+    stated = read_log(path, {**mapping, "time": {"unit": "us"}})
+    assert stated.time_step == pytest.approx(0.004)
+
+
+@pytest.mark.parametrize("zone", ["", "Z", "+02:00"])
+def test_dates_in_a_text_are_times(tmp_path, zone):
+    table = table_of()
+    dates = pandas.Timestamp("2024-05-01 12:00") + pandas.to_timedelta(table.t, "s")
+    table["t"] = [f"{date}{zone}" for date in dates]
+    path = written(tmp_path, table)
+    log = read_log(path, MAPPING)
+    assert log.time_step == pytest.approx(0.1)
+    assert len(log) == 300
+    rates = inspect_log(path, time="t").streams["rate [Hz]"]
+    assert rates[0] == pytest.approx(10)
+
+
+def test_dates_that_may_be_mistaken_are_refused_with_a_way_out(tmp_path):
+    table = table_of().assign(t="01.05.2024 12:00")
+    with pytest.raises(DataError, match=r"2024-05-01 12:00:00.*time: \{step"):
+        read_log(written(tmp_path, table), MAPPING)
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_lines_of_an_instrument_are_no_rows(tmp_path, delimiter):
+    lines = ["Sampling rate,100", "Device,X", table_of().to_csv(index=False)]
+    text = "\n".join(lines).replace(",", delimiter)
+    (tmp_path / "log.csv").write_text(text)
+    log = read_log(tmp_path / "log.csv", MAPPING)
+    np.testing.assert_array_equal(log.runs[0].states[:, 0], table_of()["x"])
+
+
+def test_numbers_that_pandas_writes_above_rows_are_no_row(tmp_path):
+    table = table_of()
+    pandas.DataFrame(table.to_numpy()).to_csv(tmp_path / "log.csv")
+    mapping = {"time": 2, "states": {"x": [3]}, "inputs": {"u": [4]}}
+    log = read_log(tmp_path / "log.csv", mapping)
+    assert len(log) == len(table)
+
+
+@pytest.mark.parametrize("name", ["q{}", "q_{}", "pose.orientation.{}"])
+def test_names_of_quaternions_say_their_order(name):
+    def mapping(entries, order):
+        columns = [name.format(entry) for entry in entries]
+        signal = {"columns": columns, "kind": "quaternion", "order": order}
+        return {"states": {"attitude": signal}}
+
+    LogMapping.from_dict(mapping("wxyz", "wxyz"))
+    LogMapping.from_dict(mapping("xyzw", "xyzw"))
+    for entries, order in (("wxyz", "xyzw"), ("xyzw", "wxyz"), ("zyxw", "xyzw")):
+        with pytest.raises(SettingError, match="order: must be that of the columns"):
+            LogMapping.from_dict(mapping(entries, order))
+
+
+QUATERNION = {
+    "time": "t",
+    "rest": "use",
+    "held": "use",
+    "states": {"attitude": {"columns": ["a", "b", "c", "d"], "kind": "quaternion"}},
+    "inputs": {"u": ["u"]},
+}
+
+
+def attitudes():
+    angles = 0.01 * np.arange(300)
+    entries = {"a": np.sin(angles), "b": 0.0, "c": 0.0, "d": np.cos(angles)}
+    return table_of().assign(**entries)
+
+
+def test_zeros_before_an_estimator_begins_are_no_attitude(tmp_path):
+    table = attitudes()
+    table.loc[:19, ["a", "b", "c", "d"]] = 0.0
+    log = read_log(written(tmp_path, table), QUATERNION)
+    assert len(log) == 280
+    assert "20 samples of attitude are zeros" in texts(log, "empty sample")[0]
+
+
+def test_rows_outside_of_keep_may_be_wrong(tmp_path):
+    table = attitudes()
+    table.loc[:19, "a"] = 7.0
+    path = written(tmp_path, table)
+    with pytest.raises(DataError, match="in row 1 has norm"):
+        read_log(path, QUATERNION)
+    assert len(read_log(path, {**QUATERNION, "keep": {"t": [2.0, None]}})) == 280
+
+
+def test_rows_without_a_time_are_left_out(tmp_path):
+    table = table_of()
+    table.loc[100:109, "t"] = np.nan
+    log = read_log(written(tmp_path, table), MAPPING)
+    assert len(log) == 290
+    assert log.runs[0].begins == (0, 100)
+    assert texts(log, "no stamp") == ["10 rows without a time: left out"]
+
+
+def test_a_vehicle_that_stops_at_once_may_be_learned_from(tmp_path):
+    k = np.arange(300)
+    table = table_of().assign(
+        v=np.where(k % 60 < 40, 0.5 + 0.01 * np.sin(k), 0.0),
+        w=np.where(k % 60 < 40, 0.1 + 0.01 * np.cos(k), 0.0),
+    )
+    mapping = {**MAPPING, "states": {"v": ["v"], "w": ["w"]}, "rest": "use"}
+    path = written(tmp_path, table)
+    assert texts(read_log(path, mapping), "all zero")
+    assert len(read_log(path, {**mapping, "held": "use"})) == 300
+
+
+def test_quantities_of_unlike_size_in_one_signal_are_noted(tmp_path):
+    table = table_of().assign(p=1e5 * np.sin(0.03 * np.arange(300)))
+    path = written(tmp_path, table)
+    together = read_log(path, {**MAPPING, "states": {"y": ["x", "p"]}})
+    (text,) = texts(together, "unlike entries")
+    assert "x hardly counts; name a signal for each quantity" in text
+    apart = read_log(path, {**MAPPING, "states": {"x": ["x"], "p": ["p"]}})
+    assert not texts(apart, "unlike entries")
+
+
+def test_rounded_stamps_are_named_where_many_repeat(tmp_path):
+    table = table_of(step=0.0025)
+    table["t"] = table["t"].round(2)
+    (text,) = texts(read_log(written(tmp_path, table), MAPPING), "repeated stamp")
+    assert "are the stamps rounded?" in text
+
+
+def test_samples_a_tenth_of_a_microsecond_apart_are_told_apart(tmp_path):
+    table = table_of(step=1e-7)
+    mapping = {**MAPPING, "rate": 1e7, "max_gap": 1e-6, "rest": "use"}
+    log = read_log(written(tmp_path, table), mapping)
+    inputs = log.runs[0].inputs[:, 0]
+    np.testing.assert_array_equal(inputs[:290], table["u"][:290])
+
+
+def test_row_vectors_are_columns(tmp_path):
+    table = table_of()
+    arrays = {name: table[name].to_numpy()[None] for name in table}
+    np.savez(tmp_path / "log.npz", **arrays)
+    log = read_log(tmp_path / "log.npz", MAPPING)
+    np.testing.assert_array_equal(log.runs[0].states[:, 0], table["x"])
