@@ -1013,6 +1013,12 @@ static real zero_row_size(const gpmpc_program *work)
     return size > 0 ? smaller(1, size) : 1;
 }
 
+/* The weight of a constraint in a proof: none where it may be violated for a price. */
+static real weight_in_proof(const gpmpc_program *work, const real *ray, int p)
+{
+    return work->cap[p] < LARGEST ? 0 : ray[p];
+}
+
 /* Returns whether the multipliers prove that no x keeps the bounds (Farkas): with
    y'C = 0, up to rounding, sum y+ upper + y- lower < 0. */
 static int proves_infeasibility(gpmpc_program *work, const real *ray)
@@ -1021,15 +1027,16 @@ static int proves_infeasibility(gpmpc_program *work, const real *ray)
     real sizes = 0;
     int p;
     for (p = 0; p < constraint_count(work); p++) {
-        real repaired = ray[p];
+        real repaired = weight_in_proof(work, ray, p);
         real bound;
         if (p < N) {
-            real rest = ray[p];
-            real rounding = absolute(ray[p]);
+            real rest = repaired;
+            real rounding = absolute(repaired);
             int i;
             for (i = 0; i < work->rows; i++) {
-                rest += ray[N + i] * work->G[i][p];
-                rounding += absolute(ray[N + i] * work->G[i][p]);
+                real weight = weight_in_proof(work, ray, N + i);
+                rest += weight * work->G[i][p];
+                rounding += absolute(weight * work->G[i][p]);
             }
             if (absolute(rest) > ROUNDING_OF_SUMS * rounding)
                 repaired -= rest;
@@ -1042,7 +1049,7 @@ static int proves_infeasibility(gpmpc_program *work, const real *ray)
         total += repaired * bound;
         sizes += absolute(repaired * bound);
         if (work->row_end[p] == 0)
-            sizes += absolute(ray[p]) * zero_row_size(work);
+            sizes += absolute(repaired) * zero_row_size(work);
     }
     return total < -ROUNDING_OF_SUMS * sizes;
 }

@@ -266,7 +266,7 @@ class DualActiveSet:
             record[layout.STATUS] = layout.TIME_LIMIT
         is_at_limit = status == layout.ITERATION_LIMIT
         reached_own_limit = is_at_limit and self.iteration_limit is not None
-        if reached_own_limit or _is_final(record, problem):
+        if reached_own_limit or _is_final(record, problem, caps):
             return problem, record
 
         # A second try from the last working set. Its factor is computed anew, as only
@@ -277,7 +277,7 @@ class DualActiveSet:
         record = record.copy()
         solve_kernel(*problem, guess, memory, record)
         record[layout.ITERATIONS] += iterations
-        if not _is_final(record, problem):
+        if not _is_final(record, problem, caps):
             record = rescue(problem, caps, record, limit, late)
         return problem, record
 
@@ -362,12 +362,12 @@ def _for_kernel(problem: QuadraticProgram) -> QuadraticProgram:
     return QuadraticProgram.unchecked(P, q, G, lower, upper)
 
 
-def _is_final(record: Array, problem: QuadraticProgram) -> bool:
+def _is_final(record: Array, problem: QuadraticProgram, caps: Array) -> bool:
     """Returns whether a record needs no second look.
 
     An infeasible one needs Farkas' proof.
     """
     if record[layout.STATUS] == layout.INFEASIBLE:
         ray = record[layout.HEADER + len(problem.q) :][: len(problem.lower)]
-        return proves_infeasibility(ray, problem.G, problem.lower, problem.upper)
+        return proves_infeasibility(ray, problem.G, problem.lower, problem.upper, caps)
     return record[layout.STATUS] in (layout.SOLVED, layout.TIME_LIMIT)

@@ -427,7 +427,9 @@ class _AccurateSolver:
         ray[W] = np.where(wrong, 0.0, -sense * r)
         ray[p] = sense
         ray = ray * self.E
-        proven = proves_infeasibility(ray, self.unscaled_G, *self.unscaled_bounds)
+        proven = proves_infeasibility(
+            ray, self.unscaled_G, *self.unscaled_bounds, self.caps
+        )
         self.ray = ray if proven else None
         return proven
 

@@ -314,10 +314,13 @@ def _read_active_set(active_set: ArrayLike, M: int) -> Array:
 
 
 @np.errstate(all="ignore")  # what is not finite proves nothing
-def proves_infeasibility(ray: Array, G: Array, lower: Array, upper: Array) -> bool:
+def proves_infeasibility(
+    ray: Array, G: Array, lower: Array, upper: Array, caps: Array | None = None
+) -> bool:
     """Returns whether ``ray`` (M,) is Farkas' proof that no x satisfies the bounds.
 
-    The bounds are ``lower <= [x; Gx] <= upper``.
+    The bounds are ``lower <= [x; Gx] <= upper``. Those whose multiplier has a finite
+    cap (M,) may be violated for a price: their weights in the ray count as zero.
 
     There is none if a ray y satisfies C'y = 0 and sum(y+ upper) + sum(y- lower) < 0:
     summing the constraints with these weights gives 0 < 0. In floating point C'y is not
@@ -326,6 +329,8 @@ def proves_infeasibility(ray: Array, G: Array, lower: Array, upper: Array) -> bo
     satisfy the constraints.
     """
     n = G.shape[1]
+    if caps is not None:
+        ray = np.where(np.isfinite(caps), 0.0, ray)
     rest = ray[:n] + ray[n:] @ G
     rounding = _ROUNDING_OF_SUMS * (np.abs(ray[:n]) + np.abs(ray[n:]) @ np.abs(G))
     repaired = ray.copy()

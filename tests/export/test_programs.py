@@ -35,3 +35,24 @@ def test_a_zero_row_proves_infeasibility_beyond_rounding_only(compiled):
         )
         assert DualActiveSet().solve(problem).status is status
         assert compiled.solve(problem).status is status
+
+
+PRICED_ROWS = [[1e7, 0.0], [0.0, 1e-6], [-1.0, -1.0]]
+
+
+def test_a_row_at_a_price_contradicts_nothing(compiled):
+    """Two rows of sizes far apart bound x; the first may be violated for next to
+    nothing."""
+    problem = QuadraticProgram(
+        np.eye(2), [-10.0, -10.0], PRICED_ROWS, h_upper=[1e7, 1e-6, -3.0]
+    )
+    prices = np.array([1e-3, NONE, NONE])
+    solution = DualActiveSet().solve(problem, prices=prices)
+    prepared = DualActiveSet().prepare(problem.P, problem.G, prices)
+    again = prepared.solve(problem.q, problem.lower, problem.upper)
+    answer = compiled.solve(problem, prices)
+    for result in (solution, again, answer):
+        assert result.status is Status.SOLVED
+        np.testing.assert_allclose(result.x, [2.0, 1.0], rtol=1e-9)
+    assert DualActiveSet().solve(problem).status is Status.INFEASIBLE
+    assert compiled.solve(problem).status is Status.INFEASIBLE
