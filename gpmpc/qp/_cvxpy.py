@@ -105,8 +105,10 @@ class CvxpySolver:
             compiled.y.value = transform.factor @ (warm_start.x - transform.free)
         built = perf_counter()
         choices = [self.options]
-        if self.options is None:
-            choices = [TIGHT.get(self.name, {}), {}]
+        if self.options is None:  # the solver's own, and tight ones before
+            choices = [{}]
+            if self.name in TIGHT:
+                choices.insert(0, TIGHT[self.name])
         best = None
         least = np.inf
         for options in choices:

@@ -29,7 +29,7 @@ from gpmpc.qp._dual_kernels import SIGNATURE, solve_kernel
 from gpmpc.qp._dual_rescue import rescue
 from gpmpc.qp._problem import (
     QuadraticProgram,
-    check_limits,
+    check_iteration_limit,
     check_positive,
     multiplier_caps,
 )
@@ -65,7 +65,8 @@ class DualActiveSet:
 
     An object holds settings, and memory for each shape of G that it has met. It may
     serve many threads all the same: a solve keeps the interpreter's lock, so that no
-    two are in the same memory at once.
+    two are in the same memory at once. A Python without that lock needs an object for
+    each thread.
 
     Args:
         tolerance: Largest residual of a solution called ``SOLVED``, as a share of its
@@ -92,7 +93,9 @@ class DualActiveSet:
 
     def __post_init__(self):
         check_positive(self, "tolerance")
-        check_limits(self, "iteration_limit", "time_limit")
+        check_iteration_limit(self.iteration_limit)
+        if self.time_limit is not None:
+            check_positive(self, "time_limit")
         global _solve_unchecked
         compile_for(solve_kernel, SIGNATURE)
         _solve_unchecked = unchecked_entry_point(solve_kernel)
@@ -134,18 +137,19 @@ class DualActiveSet:
             else:
                 workplace = self._priced_workplace(shape, prices)
         except (AttributeError, KeyError, TypeError, ValueError):
+            # The first program of its shape, an unchecked one without a shape, prices
+            # that are no numbers, or no program at all
             if not isinstance(problem, tuple):
                 got = type(problem).__name__
                 raise ProblemError(
                     f"problem must be QuadraticProgram(...); got {got}"
                 ) from None
-            # the first program of its shape, or an unchecked one without a shape
             problem = QuadraticProgram.from_stacked(*problem)
             workplace = self._workplace(problem.G.shape, prices)
         P, q, G, lower, upper = problem
         caps, memory, record_size, x_slice = workplace
         record = _empty(record_size)
-        status = _MISUSE
+        status = _MISUSE  # until the kernel has run; ``_finish`` finds out why not
         try:
             guess = _NO_RECORD
             if warm_start is not None:
@@ -248,6 +252,8 @@ class DualActiveSet:
             status = solve_kernel(*problem, guess, memory, record)
         else:
             problem = _for_kernel(problem)
+        # From here on ``status`` is what the kernel returned last. The record's own may
+        # say more: that time is up.
 
         def late() -> bool:
             if self.time_limit is None:
@@ -265,14 +271,13 @@ class DualActiveSet:
         if status == layout.ITERATION_LIMIT and late():
             record[layout.STATUS] = layout.TIME_LIMIT
         is_at_limit = status == layout.ITERATION_LIMIT
-        reached_own_limit = is_at_limit and self.iteration_limit is not None
-        if reached_own_limit or _is_final(record, problem, caps):
+        is_at_own_limit = is_at_limit and self.iteration_limit is not None
+        if is_at_own_limit or _is_final(record, problem, caps):
             return problem, record
 
         # A second try from the last working set. Its factor is computed anew, as only
-        # a solved record hands its factor on. The kernel reads one record and writes
-        # another, which stays a copy if the kernel refuses the program again; the
-        # status is in the record.
+        # a solved record hands its factor on. The kernel writes the new record, unless
+        # it returns MISUSE: the copy then stays as it is.
         guess = record
         record = record.copy()
         solve_kernel(*problem, guess, memory, record)
@@ -285,8 +290,8 @@ class DualActiveSet:
 class Prepared:
     """A problem whose P and G stay the same.
 
-    Made by ``DualActiveSet.prepare``. Nothing of it can be set. Threads may share it: a
-    solve keeps the interpreter's lock, and so its memory to itself.
+    Made by ``DualActiveSet.prepare``, with copies of P and G. Nothing of it can be set.
+    Threads may share it as they may the solver.
     """
 
     __slots__ = ("_G", "_P", "_solver", "_workplace")
@@ -294,8 +299,8 @@ class Prepared:
     def __init__(
         self, solver: DualActiveSet, problem: QuadraticProgram, prices: ArrayLike | None
     ):
-        self._P = problem.P
-        self._G = problem.G
+        self._P = problem.P.copy()
+        self._G = problem.G.copy()
         self._solver = solver
         self._workplace = solver._workplace(problem.G.shape, prices, prepared=True)
         _, memory, record_size, _ = self._workplace
@@ -328,7 +333,7 @@ class Prepared:
         G = self._G
         caps, memory, record_size, x_slice = self._workplace
         record = _empty(record_size)
-        status = _MISUSE
+        status = _MISUSE  # until the kernel has run; ``_finish`` finds out why not
         try:
             guess = _NO_RECORD
             if warm_start is not None:

@@ -36,7 +36,12 @@ from scipy.optimize import linprog
 from gpmpc._calls import explains_arguments
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_rescue import rescue
-from gpmpc.qp._problem import ABSENT, QuadraticProgram, check_limits, check_positive
+from gpmpc.qp._problem import (
+    ABSENT,
+    QuadraticProgram,
+    check_iteration_limit,
+    check_positive,
+)
 from gpmpc.qp._solution import (
     QPSolution,
     WarmStart,
@@ -99,7 +104,7 @@ class PrimalActiveSet:
 
     def __post_init__(self):
         check_positive(self, "tolerance")
-        check_limits(self, "iteration_limit")
+        check_iteration_limit(self.iteration_limit)
 
     @np.errstate(over="ignore", invalid="ignore")  # what is not finite is seen below
     def solve(
@@ -193,7 +198,7 @@ def _read_warm_start(record: Array, problem: QuadraticProgram) -> tuple[Array, A
     """Returns the point and the labels of working constraints to start from."""
     n = len(problem.q)
     M = len(problem.lower)
-    if not len(record):
+    if len(record) < layout.HEADER + n + 2 * M:  # none, or one that was cut off
         return np.zeros(n), np.zeros(0)
     if record[layout.VARIABLES] != n or record[layout.CONSTRAINTS] != M:
         return np.zeros(n), np.zeros(0)

@@ -35,12 +35,16 @@ def _as_float_array(
 
     It is ``value`` itself if that is one.
     """
-    try:
-        array = np.require(value, np.float64, ["C", "A", "W"])
-    except (TypeError, ValueError) as error:
-        raise ProblemError(
-            f"{name} must be an array of real numbers; got {value!r}"
-        ) from error
+    array = None
+    # of a complex array NumPy would drop the imaginary part, of a masked one the mask
+    if not (np.iscomplexobj(value) or np.ma.is_masked(value)):
+        try:
+            # a matrix is multiplied as no array is: "E"
+            array = np.require(value, np.float64, ["C", "A", "W", "E"])
+        except (TypeError, ValueError):
+            array = None
+    if array is None:
+        raise ProblemError(f"{name} must be an array of real numbers; got {value!r}")
     # for NumPy an axis of length 1 may have any stride
     if array.size and array.strides != np.empty(array.shape).strides:
         array = array.copy()
@@ -102,6 +106,11 @@ def _check_bounds(
 
 
 class _Arrays(NamedTuple):
+    """The arrays of a program, as compiled code takes them.
+
+    A program is exactly these five: solvers, solutions and recordings take it apart.
+    """
+
     P: Array
     q: Array
     G: Array
@@ -215,13 +224,13 @@ def _check_matrices(
     P: ArrayLike, q: ArrayLike, G: ArrayLike | None
 ) -> tuple[tuple[int, int], Array, Array, Array]:
     """Returns (n, m), P, q and G as arrays."""
-    shape = np.shape(P)
+    shape = _shape_of("P", P)
     if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
         raise ProblemError(
             f"P must be a square matrix with at least one row; got shape {shape}"
         )
     n = shape[0]
-    rows = np.shape(G) if G is not None else (0, n)
+    rows = _shape_of("G", G) if G is not None else (0, n)
     if len(rows) != 2:
         raise ProblemError(f"G must be a matrix of {n} columns; got shape {rows}")
     P = _as_float_array("P", P, (n, n), finite=True)
@@ -233,6 +242,16 @@ def _check_matrices(
     )
     _check_hessian(P)
     return (n, rows[0]), P, q, G
+
+
+def _shape_of(name: str, matrix: ArrayLike) -> tuple[int, ...]:
+    """Returns the shape of what may be nested lists of one length."""
+    try:
+        return np.shape(matrix)
+    except ValueError as error:
+        raise ProblemError(
+            f"{name} must be a matrix, of rows of one length; got {matrix!r}"
+        ) from error
 
 
 def multiplier_caps(prices: ArrayLike | None, variables: int, rows: int) -> Array:
@@ -259,11 +278,15 @@ def check_positive(settings: object, *names: str) -> None:
     for name in names:
         value = getattr(settings, name)
         is_number = isinstance(value, int | float | np.number)
-        if not (is_number and value > 0):
+        if not (is_number and value > 0) or isinstance(value, bool):
             raise ProblemError(f"{name} must be positive; got {value}")
 
 
-def check_limits(settings: object, *names: str) -> None:
-    """Raises ``ProblemError`` unless limits of a solver are positive or None."""
-    names = tuple(name for name in names if getattr(settings, name) is not None)
-    check_positive(settings, *names)
+def check_iteration_limit(limit: int | None) -> None:
+    """Raises ``ProblemError`` unless a limit is a positive whole number or None."""
+    if limit is None:
+        return
+    is_whole = isinstance(limit, int | np.integer) and not isinstance(limit, bool)
+    if not is_whole or limit < 1:
+        rule = "iteration_limit must be positive, a whole number"
+        raise ProblemError(f"{rule}; got {limit}")

@@ -3,6 +3,7 @@ import pytest
 
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
+from gpmpc.status import Status
 from tests.qp.problems import solve_stacked
 
 EYE = np.eye(2)
@@ -205,3 +206,43 @@ def test_what_is_skew_by_rounding_is_taken_for_symmetric(size, skew, accepted):
     else:
         with pytest.raises(ProblemError, match="symmetric"):
             DualActiveSet().solve(program)
+
+
+class TestArraysOfOtherKinds:
+    def test_a_matrix_is_solved_as_the_array_it_holds(self):
+        with pytest.warns(PendingDeprecationWarning):
+            G = np.matrix([[1.0, 1.0]])
+        solution = DualActiveSet().solve(
+            QuadraticProgram(np.eye(2), [-1.0, -1.0], G, h_upper=[1.0])
+        )
+        assert solution.status is Status.SOLVED
+        assert max(solution.residuals()) < 1e-12
+        np.testing.assert_allclose(solution.x, [0.5, 0.5])
+
+    @pytest.mark.parametrize(
+        "q", [[1.0, 2.0 + 1j], np.ma.masked_array([1.0, 2.0], mask=[0, 1])]
+    )
+    def test_numbers_that_are_not_real_or_masked_are_refused(self, q):
+        with pytest.raises(ProblemError, match="q must be an array of real numbers"):
+            QuadraticProgram(np.eye(2), q)
+
+    def test_rows_of_unlike_length_are_refused(self):
+        with pytest.raises(ProblemError, match="P must be a matrix"):
+            QuadraticProgram([[1.0], [0.0, 1.0]], [1.0, 1.0])
+
+    @pytest.mark.parametrize("solver", [DualActiveSet, PrimalActiveSet])
+    @pytest.mark.parametrize("limit", [2.5, np.inf, True, 0])
+    def test_a_limit_is_a_whole_number(self, solver, limit):
+        with pytest.raises(ProblemError, match="whole number"):
+            solver(iteration_limit=limit)
+
+    def test_a_prepared_program_is_not_changed_from_outside(self):
+        P = np.eye(2)
+        G = np.array([[1.0, 0.0]])
+        prepared = DualActiveSet().prepare(P, G)
+        G[0, 1] = 1.0
+        P[0, 0] = 100.0
+        bounds = np.array([-np.inf, -np.inf, -np.inf]), np.array([np.inf, np.inf, 1.0])
+        solution = prepared.solve(np.array([-2.0, -2.0]), *bounds)
+        np.testing.assert_allclose(solution.x, [1.0, 2.0])
+        assert max(solution.residuals()) < 1e-12
