@@ -96,12 +96,11 @@ def standardize(
     >>> scaling.scale(torch.tensor([[1.0], [3.0]])).flatten().tolist()
     [-1.0, 1.0]
     """
-    # about the first row: a mean far from zero is rounded
-    deviation = (columns - columns[0]).std(dim=0, correction=0)
-    # squares of the least numbers are zero
-    constant = _constant(columns, names, resolution) | (deviation == 0.0)
-    offset = centre(columns, names).offset
-    return Scaling(offset=offset, factor=torch.where(constant, 1.0, deviation))
+    constant = _constant(columns, names, resolution)
+    deviation = columns.std(dim=0, correction=0)
+    return Scaling(
+        offset=columns.mean(dim=0), factor=torch.where(constant, 1.0, deviation)
+    )
 
 
 def min_max(

@@ -4,7 +4,6 @@ A mapping is a YAML file or a dictionary (docs/guide_log.md). It names units, fr
 conventions; states come out in m, rad, s, kg and their products.
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -37,8 +36,6 @@ _PLAIN_KEYS = (  # whose values are taken as they are
     "model",
     "stamp",
 )
-# a column that is called as one of the four, such as "qw", "q_x", "orientation.y"
-_QUATERNION_ENTRY = re.compile(r"(?:.*[^A-Za-z])?[Qq]?([WXYZwxyz])")
 _AXES_KEY = "frame"  # as files call the axes of all states
 _SIGNAL_KEYS = (
     "columns",
@@ -89,7 +86,6 @@ class Signal:
     def __post_init__(self) -> None:
         self._check_choices()
         self._check_columns()
-        self._check_order()
         self._check_number_or_numbers("scale")
         self._check_number_or_numbers("delay")
         self._check_delay()
@@ -114,19 +110,6 @@ class Signal:
             raise SettingError(
                 f"{self._key}.columns",
                 f"must be {number or 1} names of columns; got {list(self.columns)}",
-            )
-
-    def _check_order(self) -> None:
-        """Raises ``SettingError`` where the columns' names contradict the order."""
-        if self.kind != "quaternion":
-            return
-        matches = [_QUATERNION_ENTRY.fullmatch(column) for column in self.columns]
-        named = "".join(match[1] for match in matches if match is not None).lower()
-        if set(named) == set("wxyz") and named != self.order:
-            raise SettingError(
-                f"{self._key}.order",
-                f"must be that of the columns {', '.join(self.columns)} "
-                f"(order: xyzw or wxyz); got {self.order}",
             )
 
     def _check_number_or_numbers(self, name: str) -> None:
