@@ -44,7 +44,7 @@ Array = np.ndarray
 # With 4 instead, a car beside its lane was lost now and then; with 1 a reactor's
 # economic cost was worth more than its bound.
 WORTH = 2.0
-# With .05 a car comes back to its lane later; with .25 one of a poor model was lost.
+# With .05 a car comes back to its lane later; with .2 one of a poor model falls behind.
 SHARE = 0.1
 TRIALS = 5  # prices between the lowest and the exact one
 NO_PRICE = 1e-9  # of a row that does not count: it keeps its place among the others
