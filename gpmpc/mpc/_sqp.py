@@ -270,7 +270,7 @@ class Globalization:
         return self._end_without_step(local, proposed, is_optimum)
 
     def _raise_hard_price(self, multipliers: Array) -> None:
-        """Raises the price of hard rows above theirs of all multipliers (H, r)."""
+        """Raises the price of hard rows above their own multipliers, of (H, r) all."""
         hard = np.isinf(self._merit_terms.prices)
         if hard.any():
             largest = float(np.abs(multipliers[:, hard]).max())

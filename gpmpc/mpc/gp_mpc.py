@@ -50,12 +50,7 @@ from gpmpc.mpc._controller import (
     read_parameters,
 )
 from gpmpc.mpc._cost import FunctionNotFinite
-from gpmpc.mpc._elastic import (
-    NO_PRICE,
-    TRIALS,
-    are_kept_again,
-    elastic_limits,
-)
+from gpmpc.mpc._elastic import NO_PRICE, TRIALS, are_kept_again, elastic_limits
 from gpmpc.mpc._guess import (
     initial_guess,
     is_contradicted,

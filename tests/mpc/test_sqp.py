@@ -26,6 +26,7 @@ from gpmpc.mpc import (
 )
 from gpmpc.mpc._guess import initial_guess, read_request
 from gpmpc.mpc._roll_out import roll_out
+from gpmpc.mpc._sqp import Progress
 from gpmpc.propagation import Linearization
 from gpmpc.qp import DualActiveSet
 from gpmpc.status import Status
@@ -453,3 +454,13 @@ def test_a_guess_rests_at_the_state_where_its_inputs_overflow():
     decision = controller.control(belief, reference, last, plan=np.full((12, 1), 50.0))
     assert decision.status is Status.SOLVED
     assert np.allclose(decision.inputs, last.inputs, atol=1e-4)
+
+
+def test_a_stall_needs_two_rates_that_were_seen():
+    """A first step says nothing of what rounding leaves, however small it is."""
+    progress = Progress()
+    for steps in (1, 2):
+        progress = progress.after(9e-6)
+        assert progress.steps == steps
+        assert not progress.is_converged(tolerance=1e-8)
+    assert progress.after(9e-6).is_converged(tolerance=1e-8)
