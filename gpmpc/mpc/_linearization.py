@@ -58,6 +58,7 @@ from gpmpc.mpc._controller import KEPT, Decision, Request, check_controller
 from gpmpc.mpc._cost import PENALIZED, by_stage
 from gpmpc.mpc._linear_quadratic import (
     COVARIANCES,
+    CondensedProgram,
     Covariance,
     InputBounds,
     Plan,
@@ -66,6 +67,7 @@ from gpmpc.mpc._linear_quadratic import (
     StageRows,
     Stages,
     evaluate_stages,
+    expand,
 )
 from gpmpc.mpc._riccati import finite_horizon_lqr
 from gpmpc.mpc.problem import Problem
@@ -162,6 +164,27 @@ class LocalProblem(NamedTuple):
     covariances: Array
     rows: StageRows  # tightened by the covariances
     cost: QuadraticCost  # with outputs linearised at a plan
+
+    def with_solution(
+        self, program: CondensedProgram, unknowns: Array, request: Request
+    ) -> "LocalProblem":
+        """Returns the problem with the plan that a program's solution means.
+
+        Stages and rows stay where they were linearised.
+
+        Args:
+            program: Condensed from this problem.
+            unknowns: That solve it (H m,).
+            request: Of the decision.
+        """
+        inputs, states = expand.unchecked(
+            self.stages,
+            self.plan.states[0],
+            program.feedback,
+            request.references.previous_input,
+            np.ascontiguousarray(unknowns, dtype=np.float64),
+        )
+        return self._replace(plan=Plan(states, inputs, self.covariances))
 
     def stage_costs(self, references: References) -> Array:
         """Returns what each stage of the plan costs (H,)."""

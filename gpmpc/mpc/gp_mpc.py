@@ -6,7 +6,7 @@ A decision follows the method in its order:
     plan       a first guess: the last plan, shifted               (``_guess``)
     local      stages, covariances, rows and cost at the plan      (``_linearization``)
     program    the states eliminated                               (``_condense``)
-    solution   of the quadratic program                            (``gpmpc.qp``)
+    solution   of the quadratic program                      (``_priced_solver``)
     step       taken whole, or as far as it pays                   (``_sqp``)
     decision   the plan, judged                                    (here)
 
@@ -46,11 +46,9 @@ from gpmpc.mpc._controller import (
     Decision,
     Reference,
     Request,
-    Timing,
     read_parameters,
 )
 from gpmpc.mpc._cost import FunctionNotFinite
-from gpmpc.mpc._elastic import NO_PRICE, TRIALS, are_kept_again, elastic_limits
 from gpmpc.mpc._guess import (
     initial_guess,
     is_contradicted,
@@ -61,19 +59,19 @@ from gpmpc.mpc._linear_quadratic import (
     CondensedProgram,
     Covariance,
     Plan,
-    expand,
 )
 from gpmpc.mpc._linearization import LocalProblem, PredictionModel, PredictionSettings
 from gpmpc.mpc._novelty import data_scales, novelty_of, novelty_when_read
+from gpmpc.mpc._priced_solver import PricedSolver
 from gpmpc.mpc._roll_out import (
     MISS_RATIO,
     Outcome,
     close_defects,
-    cost_when_followed,
     outcome_of_inputs,
 )
 from gpmpc.mpc._sqp import FAILURES, Globalization, Iterate, measure_continuity
 from gpmpc.mpc._stability import Stability, stability
+from gpmpc.mpc._stopwatch import Stopwatch
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Propagator
 from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
@@ -87,34 +85,6 @@ _MOST = 10  # programs of a step, where their number is not set
 _LOOSE = 1e-2  # tolerance there
 _TIGHT = 1e-6  # tolerance where it is set
 _PAYS = 0.7  # of a first plan's cost, below which one that took more programs is taken
-
-
-class Stopwatch:
-    """Sums the wall time of the parts of a decision."""
-
-    def __init__(self, seconds_before: float = 0.0):
-        self._last = perf_counter() - seconds_before
-        self._start = self._last
-        self._seconds = {"model": 0.0, "build": 0.0, "solve": 0.0}
-
-    def lap(self, part: str) -> None:
-        """Adds the time since the last lap to a part."""
-        now = perf_counter()
-        self._seconds[part] += now - self._last
-        self._last = now
-
-    @property
-    def elapsed(self) -> float:
-        """All time so far [s]."""
-        return perf_counter() - self._start
-
-    @property
-    def timing(self) -> Timing:
-        """The sums so far."""
-        seconds = self._seconds
-        return Timing(
-            model=seconds["model"], build=seconds["build"], solve=seconds["solve"]
-        )
 
 
 @explains_arguments
@@ -257,7 +227,7 @@ class GPMPC:
         request = read_request(
             self.prediction, belief, reference, previous, parameters, plan
         )
-        return self._decide(request, Stopwatch())
+        return self._decide(request, Stopwatch(self.budget))
 
     def _decide(
         self,
@@ -355,7 +325,7 @@ class GPMPC:
         linearizer = self.prediction.linearizer
         if linearizer.depends_on_covariance or not quick.applicable:
             return quick
-        if self.is_late(stopwatch):
+        if stopwatch.is_late:
             return quick
         try:
             thorough = self._improve(local, request, stopwatch, self._most_programs)
@@ -394,10 +364,6 @@ class GPMPC:
             self.prediction, local, decision.inputs, decision.covariances, request
         )
 
-    def is_late(self, stopwatch: Stopwatch) -> bool:
-        """Returns whether a decision has spent its budget."""
-        return self.budget is not None and stopwatch.elapsed > self.budget
-
     def control_many(
         self,
         beliefs: Sequence[Gaussian],
@@ -425,12 +391,15 @@ class GPMPC:
             guesses = [initial_guess(self.prediction, request) for request in finite]
             problems = iter(self.prediction.linearize_many(guesses, finite))
         except FAILURES:  # one of them spoils the batch: which one, they say alone
-            return [self._decide(request, Stopwatch()) for request in requests]
+            return [
+                self._decide(request, Stopwatch(self.budget)) for request in requests
+            ]
         seconds = (perf_counter() - start) / max(1, len(finite))
         decisions = []
         for request in requests:
             local = next(problems) if request.finite else None
-            decisions.append(self._decide(request, Stopwatch(seconds), local))
+            stopwatch = Stopwatch(self.budget, seconds_before=seconds)
+            decisions.append(self._decide(request, stopwatch, local))
         return decisions
 
     def novelty_when_read(
@@ -556,8 +525,12 @@ class _ControlStep:
         self._stopwatch = stopwatch
         self._most_programs = most_programs
         self._programs = 0  # solved so far
-        self._row_prices = self._prediction.constraints.prices
-        self._price_is_due = True  # of elastic rows, by the next program
+        self._solver = PricedSolver(
+            prediction=self._prediction,
+            solver=controller.solver,
+            request=request,
+            stopwatch=stopwatch,
+        )
         self._globalization: Globalization | None = None
         self._squared_lengths: list[float] = []  # of the programs' steps
         self._warm_start: QPSolution | None = None
@@ -599,7 +572,7 @@ class _ControlStep:
                     # A bound lies elsewhere than the program saw it.
                     plan = last_problem.plan
                     local = self._prediction.linearize(plan, self._request)
-                    self._price_is_due = True
+                    self._solver.look_again()
                     continue
                 # Who asked for a single program takes the plan as it is.
                 if self._most_programs > 1:
@@ -611,8 +584,7 @@ class _ControlStep:
     @property
     def _may_go_on(self) -> bool:
         """Whether one more program may be solved."""
-        late = self._controller.is_late(self._stopwatch)
-        return self._programs < self._most_programs and not late
+        return self._programs < self._most_programs and not self._stopwatch.is_late
 
     @property
     def _limit(self) -> Status:
@@ -636,180 +608,20 @@ class _ControlStep:
         return program
 
     def _solve(self, program: CondensedProgram, local: LocalProblem) -> QPSolution:
-        """Returns the solution of a program, warm-started from the last one.
-
-        Elastic rows that the first program cannot keep get another price, which later
-        programs of the step keep. Where a plan has missed them by more than programs
-        under the exact price promised, it is the least one.
-        """
-        solution = self._solve_priced(program, self._warm_start, self._row_prices)
-        constraints = self._prediction.constraints
-        may_give_way = (
-            constraints.any_elastic and self._row_prices is constraints.prices
-        )
-        if self._price_is_due and may_give_way and solution.status.solved:
-            violations = self._planned(program, solution, local).row_violations()
-            gives_way = constraints.elastic & (violations.max(axis=0) > KEPT)
-            if gives_way.any():
-                solution = self._solve_elastic(
-                    program, solution, local, gives_way, violations
-                )
-                self._globalization = None  # it weighs by the price before
-        self._price_is_due = False
+        """Returns the solution of a program, warm-started from the last one."""
+        prices_before = self._solver.row_prices
+        solution = self._solver.solve(program, local, self._warm_start)
+        if self._solver.row_prices is not prices_before:
+            self._globalization = None  # it weighs by the prices before
         self._programs += 1
         self._warm_start = solution
         return solution
-
-    def _solve_priced(
-        self,
-        program: CondensedProgram,
-        warm_start: QPSolution | None,
-        row_prices: Array,
-    ) -> QPSolution:
-        """Returns the solution of a program, its violations priced by row (r,)."""
-        solver = self._controller.solver
-        if isinstance(solver, DualActiveSet):
-            prices = None
-            if self._prediction.constraints.soft:
-                # The rows of the states are the last ones; all others are hard.
-                prices = np.full(len(program.G), np.inf)
-                soft = np.tile(row_prices, self._prediction.horizon)
-                prices[len(prices) - len(soft) :] = soft
-            problem = QuadraticProgram.unchecked(
-                program.P, program.q, program.G, program.lower, program.upper
-            )
-            return solver.solve(problem, warm_start, prices)
-        if warm_start is not None and warm_start.arrays[2].shape != program.G.shape:
-            warm_start = None
-        problem = QuadraticProgram.from_stacked(
-            P=program.P,
-            q=program.q,
-            G=program.G,
-            lower=program.lower,
-            upper=program.upper,
-        )
-        return solver.solve(problem, warm_start)
-
-    def _solve_elastic(
-        self,
-        program: CondensedProgram,
-        solution: QPSolution,
-        local: LocalProblem,
-        gives_way: Array,
-        violations: Array,
-    ) -> QPSolution:
-        """Returns the solution under the price that elastic rows are worth.
-
-        Args:
-            program: The program.
-            solution: Its solution under the exact price.
-            local: The problem of the program.
-            gives_way: The elastic rows that this solution misses (r,).
-            violations: By how much it misses all rows (H, r).
-        """
-        references = self._request.references
-        no_prices = self._lowered_prices(gives_way, NO_PRICE)
-        free_solution = self._solve_priced(program, solution, no_prices)
-        if not free_solution.status.solved:
-            return solution
-        free = self._planned(program, free_solution, local)
-        limits = elastic_limits(
-            free,
-            free_cost=float(free.stage_costs(references).sum()),
-            guess_cost=float(local.stage_costs(references).sum()),
-            rows=gives_way,
-            are_kept_again=are_kept_again(violations[:, gives_way]),
-            Q=self._prediction.problem.cost.Q,
-            largest_weight=self._prediction.problem.largest_weight,
-        )
-        is_first = self._programs == 0
-        if is_first and self._request.previous is not None:
-            free_cost = self._cost_when_followed(program, free_solution, local)
-            affordable_cost = free_cost + limits.extra_cost
-            if math.isfinite(affordable_cost):
-                return self._raise_elastic_price(
-                    program,
-                    solution,
-                    local,
-                    gives_way,
-                    limits.lowest_price,
-                    affordable_cost,
-                )
-        prices = self._lowered_prices(gives_way, limits.least_price)
-        return self._solve_cheaper(program, solution, prices)
-
-    def _raise_elastic_price(
-        self,
-        program: CondensedProgram,
-        solution: QPSolution,
-        local: LocalProblem,
-        gives_way: Array,
-        lowest_price: float,
-        affordable_cost: float,
-    ) -> QPSolution:
-        """Returns the solution under the highest price whose plan is affordable.
-
-        It is the exact price, or the highest of a few between the lowest and that, and
-        the lowest where none of them is.
-        """
-        if self._cost_when_followed(program, solution, local) <= affordable_cost:
-            return solution
-        highest_price = float(self._prediction.constraints.prices[gives_way].max())
-        price = min(lowest_price, highest_price)
-        best = None
-        for _ in range(TRIALS):
-            if self._controller.is_late(self._stopwatch):
-                break
-            trial_price = math.sqrt(price * highest_price)
-            prices = self._lowered_prices(gives_way, trial_price)
-            trial = self._solve_priced(program, best or solution, prices)
-            cost = self._cost_when_followed(program, trial, local)
-            if trial.status.solved and cost <= affordable_cost:
-                price = trial_price
-                best = trial
-            else:
-                highest_price = trial_price
-        prices = self._lowered_prices(gives_way, price)
-        if best is None:
-            return self._solve_cheaper(program, solution, prices)
-        self._row_prices = prices
-        return best
-
-    def _lowered_prices(self, gives_way: Array, price: float) -> Array:
-        """Returns prices (r,) of which some rows have a lower one than the exact."""
-        exact_prices = self._prediction.constraints.prices
-        return np.where(gives_way, np.minimum(price, exact_prices), exact_prices)
-
-    def _solve_cheaper(
-        self, program: CondensedProgram, solution: QPSolution, prices: Array
-    ) -> QPSolution:
-        """Returns the solution under lower prices, which later programs keep.
-
-        Where that is not solved, the solution under the exact ones stays.
-        """
-        cheaper = self._solve_priced(program, solution, prices)
-        if not cheaper.status.solved:
-            return solution
-        self._row_prices = prices
-        return cheaper
-
-    def _cost_when_followed(
-        self, program: CondensedProgram, solution: QPSolution, local: LocalProblem
-    ) -> float:
-        """Returns what the plan of a solution costs the model, rolled out along it."""
-        planned = self._planned(program, solution, local)
-        try:
-            return cost_when_followed(
-                self._prediction, planned, local, program.feedback, self._request
-            )
-        except FAILURES:
-            return math.inf
 
     def _take_step(
         self, local: LocalProblem, program: CondensedProgram, solution: QPSolution
     ) -> Iterate:
         """Takes a program's step: whole where that is enough, else globalised."""
-        planned = self._planned(program, solution, local)
+        planned = local.with_solution(program, solution.x, self._request)
         if self._whole_step_is_enough(local, planned.plan):
             return Iterate(planned, solution.status)
         if self._globalization is None:
@@ -817,7 +629,7 @@ class _ControlStep:
                 self._prediction,
                 self._request,
                 self._controller.tolerance,
-                self._row_prices,
+                self._solver.row_prices,
             )
         globalization = self._globalization
         iterate = globalization.take_step(local, program, solution, planned.plan)
@@ -849,22 +661,6 @@ class _ControlStep:
         if continues:
             self._squared_lengths.append(squared_length)
         return continues
-
-    def _planned(
-        self, program: CondensedProgram, solution: QPSolution, local: LocalProblem
-    ) -> LocalProblem:
-        """Returns a problem with the plan that the solution of its program means.
-
-        Stages and rows stay where they were linearised.
-        """
-        inputs, states = expand.unchecked(
-            local.stages,
-            local.plan.states[0],
-            program.feedback,
-            self._request.references.previous_input,
-            np.ascontiguousarray(solution.x, dtype=np.float64),
-        )
-        return local._replace(plan=Plan(states, inputs, local.covariances))
 
     def _end(
         self, iterate: Iterate, local: LocalProblem, program: CondensedProgram
