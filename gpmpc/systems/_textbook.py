@@ -183,7 +183,9 @@ def cart_pole(time_step: float = 0.05, **parameters: float) -> System:
         region=[[-2.0, -3.0, -2.0, -8.0], [2.0, 3.0, 2 * pi + 2, 8.0]],
         angles=["angle"],
         rates={"velocity": "position", "rate": "angle"},
-        lost=10.0,
+        # the pole first: a cart at rest under a hanging pole has achieved nothing
+        tracked=["angle", "position"],
+        lost={"m": 10.0},
     )
 
 

@@ -176,8 +176,8 @@ def make_environment(system: System | str, **settings: Any) -> Any:
 
     The system may be one of this package's, by name and settings. The observation is
     the state. The reward is minus the squared distance of the tracked states from the
-    goal, those in the unit of the first; an episode ends where they are farther from it
-    than at the start, and than ``System.lost``.
+    goal, summed over their units; an episode ends where those of one unit are farther
+    from it than at the start, and than ``System.lost``.
     """
     gymnasium = library("gymnasium")
     flown: System = (
@@ -208,7 +208,10 @@ def make_environment(system: System | str, **settings: Any) -> Any:
             if flown.start is None and flown.region is not None:
                 lower, upper = flown.region
                 self.state = self.np_random.uniform(lower, upper)
-            self._limit = max(flown.lost_from(flown.unit), 1.001 * self._distance())
+            self._limits = {
+                unit: max(flown.lost_from(unit), 1.001 * distance)
+                for unit, distance in self._distances().items()
+            }
             return self.state.copy(), {}
 
         def step(self, action: Array) -> tuple[Array, float, bool, bool, dict]:
@@ -218,14 +221,20 @@ def make_environment(system: System | str, **settings: Any) -> Any:
             )
             with np.errstate(over="ignore", invalid="ignore"):
                 self.state = step(flown, self.state, action)
-            distance = self._distance()
-            reward = -(distance**2)
-            terminated = not distance <= self._limit
+            distances = self._distances()
+            reward = -sum(distance**2 for distance in distances.values())
+            terminated = not all(
+                distance <= self._limits[unit] for unit, distance in distances.items()
+            )
             return self.state.copy(), reward, terminated, False, {}
 
-        def _distance(self) -> float:
+        def _distances(self) -> dict[str, float]:
+            """Returns how far the tracked states of each unit are from the goal."""
             errors = state_difference(self.state, flown.goal, flown.angle_indices)
-            return float(np.linalg.norm(errors[flown.tracked_by_unit[flown.unit]]))
+            return {
+                unit: float(np.linalg.norm(errors[places]))
+                for unit, places in flown.tracked_by_unit.items()
+            }
 
     return Environment()
 

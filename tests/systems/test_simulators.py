@@ -15,7 +15,7 @@ from gpmpc.propagation import Linearization
 from gpmpc.simulation import closed_loop, closed_loops
 from gpmpc.status import Status
 from gpmpc.studies.flight import Experiment, run_trial
-from gpmpc.systems import planar_quadrotor, step, step_many
+from gpmpc.systems import cart_pole, planar_quadrotor, step, step_many
 from gpmpc.systems.gymnasium_ import (
     OURS,
     gymnasium_system,
@@ -97,6 +97,14 @@ def test_our_environment_moves_as_its_system_and_ends_when_lost():
             break
     assert terminated
     assert np.hypot(state[0], state[2]) > 10
+
+
+def test_a_cart_at_rest_under_a_hanging_pole_is_far_from_its_goal():
+    environment = make_environment("cart_pole")
+    environment.reset(seed=0)
+    reward = environment.step(np.zeros(1))[1]
+    assert reward == pytest.approx(-(np.pi**2))
+    assert list(cart_pole().tracked_by_unit) == ["rad", "m"]
 
 
 def pendulum_environment(**settings):
