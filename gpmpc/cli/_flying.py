@@ -16,12 +16,13 @@ One that its process could not finish is a failed run with the reason in its
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
 
 from gpmpc._provenance import provenance
-from gpmpc.cli._launchers import Cause, Chunk, ChunkEnd, Launcher, Work
+from gpmpc.cli._launchers import Cause, Chunk, ChunkEnd, Launcher, Refused, Work
 from gpmpc.studies._run_folder import Busy, RunFolder, RunState
 
 _LOOK_INTERVAL = 1.0  # between two looks at runs in other hands [s]
@@ -72,6 +73,7 @@ class Flying:
     given_up: dict[str, int] = field(default_factory=dict)
     #: why runs failed whose folders cannot be written, such as on a full disk, by path
     reasons_not_kept: dict[str, str] = field(default_factory=dict)
+    _has_launched: bool = False
     _open: dict[str, Job] = field(default_factory=dict)  # by path, not settled yet
     # When an attempt failed that does not count, by path; None: each one counts.
     _failed_before: dict[str, int | None] = field(default_factory=dict)
@@ -143,7 +145,12 @@ class Flying:
         if not to_fly and not in_hand:
             return None
         chunks = self.chunked(to_fly) if to_fly else ()
-        return self.launcher.launch(self.work, chunks)
+        try:
+            ends = self.launcher.launch(self.work, chunks)
+        except Refused as error:
+            raise Refused(str(error), self._has_launched) from error
+        self._has_launched = True
+        return ends
 
     def _unsettled(self, chunk: Chunk) -> list[Job]:
         """Settles jobs of a chunk; returns those that are not."""
@@ -162,6 +169,7 @@ class Flying:
 
     def _settle_dead_chunk(self, end: ChunkEnd) -> None:
         """Settles what a process left that died, or was ended, before its chunk."""
+        _list_folders(end.chunk)
         lost_jobs = [
             job
             for job in self._unsettled(end.chunk)
@@ -241,6 +249,14 @@ class Flying:
         if str(job.folder.path) not in self._open:
             return True
         return self._settle(job)
+
+
+def _list_folders(chunk: Chunk) -> None:
+    """Lists a chunk's folders: a shared file system shows then what others wrote."""
+    for folder in chunk.folders:
+        with suppress(OSError):
+            os.listdir(folder.path.parent)
+            os.listdir(folder.path)
 
 
 def _paths(chunk: Chunk) -> list[str]:

@@ -79,6 +79,19 @@ class ChunkEnd:
     reason: str = ""
 
 
+class Refused(GpmpcError):
+    """A launcher takes no process.
+
+    Args:
+        message: Why, in a line.
+        has_launched: Whether it has taken others of this sweep before.
+    """
+
+    def __init__(self, message: str, has_launched: bool = False):
+        super().__init__(message)
+        self.has_launched = has_launched
+
+
 class Launcher(Protocol):
     """Starts processes for chunks."""
 
@@ -106,7 +119,13 @@ class Launcher(Protocol):
         ...
 
     def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
-        """Starts ``chunks``, and yields how they and the running ones end."""
+        """Starts ``chunks``, and yields how they and the running ones end.
+
+        Some may be left for a later call, where there is no room for all.
+
+        Raises:
+            Refused: It takes none, and none is running.
+        """
         ...
 
     def close(self) -> None:

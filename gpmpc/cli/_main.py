@@ -16,7 +16,7 @@ from typing import Any
 from gpmpc.cli._commands import COMMANDS, FLAGS, Result, Subcommand
 from gpmpc.cli._folders import find_modules_here, working_folder
 from gpmpc.cli._spelling import nearest
-from gpmpc.cli._terminal import print_error, redirected_output
+from gpmpc.cli._terminal import OutputEnded, print_error, redirected_output
 from gpmpc.exceptions import GpmpcError
 from gpmpc.parallel import THREADS
 
@@ -26,12 +26,12 @@ def main() -> None:
     flags = {*FLAGS} & {*sys.argv[1:]}
     words = [word for word in sys.argv[1:] if word not in FLAGS]
     output = "output"
-    if "--quiet" in flags:
-        output = "nowhere"
     if "--json" in flags:
         output = "error"
+    if "--quiet" in flags:
+        output = "nowhere"
     with redirected_output(output):
-        result = _run(words, debug="--debug" in flags)
+        result = _run(words, as_json="--json" in flags, debug="--debug" in flags)
     if "--json" in flags:
         from gpmpc.studies._document import json_text
 
@@ -40,7 +40,7 @@ def main() -> None:
         sys.exit(result.code)
 
 
-def _run(words: Sequence[str], debug: bool) -> Result:
+def _run(words: Sequence[str], as_json: bool, debug: bool) -> Result:
     """Runs a command; a mistake ends with one line, or with its traceback if asked."""
     name, *words = _with_command(words)
     command = COMMANDS.get(name)
@@ -51,6 +51,7 @@ def _run(words: Sequence[str], debug: bool) -> Result:
                 "gpmpc --help lists the commands"
             )
         arguments = _parse(name, command, words)
+        arguments.as_json = as_json
         if command.has_settings:
             return _run_with_settings(name, command, arguments)
         working_folder()
@@ -101,8 +102,19 @@ def _parse(name: str, command: Subcommand, words: Sequence[str]) -> argparse.Nam
 
 
 def _call(module: str, function: str, argument: Any) -> Result:
-    """Calls a function of a module of ``gpmpc.cli``, which is imported now."""
-    return getattr(import_module(f"gpmpc.cli.{module}"), function)(argument)
+    """Calls a function of a module of ``gpmpc.cli``, which is imported now.
+
+    Raises:
+        GpmpcError: Code of the user's ended the process (``sys.exit``).
+    """
+    try:
+        return getattr(import_module(f"gpmpc.cli.{module}"), function)(argument)
+    except OutputEnded:
+        raise
+    except SystemExit as error:
+        raise GpmpcError(
+            f"code that the settings call ended the process (exit {error.code})"
+        ) from error
 
 
 def _run_with_settings(

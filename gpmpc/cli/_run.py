@@ -27,7 +27,7 @@ from gpmpc.cli._mlflow import log_to_mlflow
 from gpmpc.cli._overrides import choices
 from gpmpc.cli._plain_settings import plain_settings
 from gpmpc.cli._settings import run_command, search_options
-from gpmpc.cli._terminal import print_error, remarks_to
+from gpmpc.cli._terminal import OutputEnded, print_error, remarks_to
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.recording import McapRecorder, RecordedSystem
 from gpmpc.simulation import Step
@@ -199,7 +199,8 @@ def run_one(to_fly: RunToFly, wait: bool = True, warn: Warn | None = None) -> Ou
                 result = header | _fly(to_fly, yaml_text, warn)
             folder.finish(result)
         except (Exception, SystemExit) as error:
-            if hasattr(error, "ray_terminate_msg"):  # Ray ends this process
+            # Ray, or who reads the output, ends this process: no failure of the run.
+            if hasattr(error, "ray_terminate_msg") or isinstance(error, OutputEnded):
                 raise
             if _was_interrupted(error):
                 raise KeyboardInterrupt from error

@@ -25,9 +25,9 @@ from typing import Any, NamedTuple
 from filelock import FileLock
 
 from gpmpc._files import write_whole
-from gpmpc.cli._launchers import Cause, Chunk, ChunkEnd, Work
+from gpmpc.cli._launchers import Cause, Chunk, ChunkEnd, Refused, Work
 from gpmpc.cli._terminal import print_error
-from gpmpc.exceptions import GpmpcError, SettingError, check_number
+from gpmpc.exceptions import SettingError, check_number
 from gpmpc.parallel import THREADS
 
 CHUNKS = "chunks"  # name of the file that a job reads
@@ -42,6 +42,7 @@ _LAST_LOOK = 10.0  # at most [s]
 _SLOWER = 1.3  # each look comes later than the one before by this factor
 _WAITS = (2.0, 10.0, 30.0)  # before a submission is tried again [s]
 _SILENCE = 60.0  # of Slurm, after which that is said [s]
+_PATIENCE = 60.0  # for the answer of one of its commands [s]
 _TAIL = 4000  # characters of a log that are read
 _FORMAT = "%j|%K|%F_%K|%T|%r|%N"
 
@@ -97,6 +98,8 @@ class _Array:
     name: str
     folder: Path
     chunks: Sequence[Chunk]
+    timeout_min: int  # wall time of its jobs [min]
+    mem_gb: float  # memory of its jobs [GB]
     #: chunks whose jobs may not have ended yet
     waiting: set[int] = field(default_factory=set)
     #: looks at the queue without a job, by chunk
@@ -193,14 +196,28 @@ class Slurm:
     def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
         """Submits chunks; yields how they, and the running ones, end.
 
+        Where Slurm refuses one array behind others, such as by a limit of jobs a user,
+        it and those behind it are left for a later call.
+
         Raises:
-            GpmpcError: Slurm takes no such job.
+            Refused: Slurm takes no such job.
         """
         most = _most_tasks()
         parts = [chunks[i : i + most] for i in range(0, len(chunks), most)]
         at_once = max(1, self._at_once // max(1, len(parts)))
-        submitted = [self._submit(work, part, at_once) for part in parts]
-        return self._watch([*self._adopted, *submitted])
+        arrays = [*self._adopted]
+        for part in parts:
+            try:
+                arrays.append(self._submit(work, part, at_once))
+            except Refused as error:
+                if not arrays:
+                    raise
+                print_error(
+                    f"{error}; what it has taken goes on, and the rest is submitted "
+                    "behind it"
+                )
+                break
+        return self._watch(arrays)
 
     def close(self) -> None:
         pass
@@ -217,16 +234,45 @@ class Slurm:
             # Where Slurm does not know it, its sweep was killed before it submitted it.
             in_queue = queue is None or any(name == folder.name for name, _ in queue)
             if in_queue or (folder / _SUBMITTED).exists():
-                content = pickle.loads((folder / CHUNKS).read_bytes())
-                chunks = [pickle.loads(chunk) for chunk in content["chunks"]]
-                yield _Array(folder.name, folder, chunks, {*range(len(chunks))})
+                array = self._read_array(folder)
+                if array is not None:
+                    yield array
+
+    def _read_array(self, folder: Path) -> _Array | None:
+        """Reads an array that was submitted; None, and a line, where that fails.
+
+        It may be of another gpmpc, whose classes are not there any more.
+        """
+        try:
+            content = pickle.loads((folder / CHUNKS).read_bytes())
+            chunks = [pickle.loads(chunk) for chunk in content["chunks"]]
+        except Exception as error:  # whatever unpickling raises
+            reason = f"{type(error).__name__}: {_one_line(str(error))}"
+            print_error(
+                f"{folder}: cannot be read ({reason}), and its jobs are not watched; "
+                f"to end them: scancel -n {folder.name}"
+            )
+            return None
+        return _Array(
+            folder.name,
+            folder,
+            chunks,
+            timeout_min=content.get("timeout_min", self._timeout_min),
+            mem_gb=content.get("mem_gb", self._mem_gb),
+            waiting={*range(len(chunks))},
+        )
 
     def _submit(self, work: Work, chunks: Sequence[Chunk], at_once: int) -> _Array:
         """Submits an array of one job a chunk."""
         name = _PREFIX + secrets.token_hex(4)
         folder = self._logs / name
         folder.mkdir(parents=True)
-        content = {"work": work, "chunks": [pickle.dumps(chunk) for chunk in chunks]}
+        content = {
+            "work": work,
+            "chunks": [pickle.dumps(chunk) for chunk in chunks],
+            "timeout_min": self._timeout_min,
+            "mem_gb": self._mem_gb,
+        }
         write_whole(folder / CHUNKS, pickle.dumps(content))
         options = self._options | {
             "job-name": name,
@@ -238,12 +284,19 @@ class Slurm:
         words = [word for key, value in options.items() for word in _option(key, value)]
         try:
             job = _sbatch(words, self._script(folder), name)
-        except GpmpcError:
+        except Refused:
             if _queue() is not None:  # so that it is known that no job needs the folder
                 shutil.rmtree(folder)
             raise
         write_whole(folder / _SUBMITTED, f"{job}\n")
-        return _Array(name, folder, chunks, {*range(len(chunks))})
+        return _Array(
+            name,
+            folder,
+            chunks,
+            timeout_min=self._timeout_min,
+            mem_gb=self._mem_gb,
+            waiting={*range(len(chunks))},
+        )
 
     def _script(self, folder: Path) -> str:
         """Returns what a job runs."""
@@ -263,16 +316,23 @@ class Slurm:
         silence_reported = False
         try:
             while any(array.waiting for array in arrays):
-                jobs = _queue()
-                if jobs is not None:
+                answer = _squeue()
+                if answer.returncode == 0:
                     last_answer = time.monotonic()
                     silence_reported = False
-                    ends = [*self._look(arrays, jobs)]
-                    yield from ends
-                    interval = _FIRST_LOOK if ends else interval
-                elif not silence_reported and time.monotonic() - last_answer > _SILENCE:
+                    ends = [*self._look(arrays, _jobs_of(answer.stdout))]
+                else:
+                    ends = [*self._look_at_logs(arrays)]
+                silence = time.monotonic() - last_answer
+                if silence > _SILENCE and not silence_reported:
                     silence_reported = True
-                    print_error("squeue has not answered for a minute; waiting for it")
+                    print_error(
+                        "squeue has told nothing for a minute "
+                        f"({_one_line(answer.stderr) or 'and not why'}); waiting for "
+                        "it, or for the logs of the jobs"
+                    )
+                yield from ends
+                interval = _FIRST_LOOK if ends else interval
                 if any(array.waiting for array in arrays):
                     time.sleep(interval)
                 interval = min(_SLOWER * interval, _LAST_LOOK)
@@ -297,6 +357,14 @@ class Slurm:
             some_wait = any(job and job.state not in _ENDED_STATES for job in states)
             if not array.waiting and not some_wait:
                 write_whole(array.folder / _ENDED, "")
+
+    def _look_at_logs(self, arrays: Sequence[_Array]) -> Iterator[ChunkEnd]:
+        """Yields the jobs that came to their end, as their logs tell."""
+        for array in arrays:
+            for index in sorted(array.waiting):
+                if _done_on(_tail(array.folder / f"{index}.log") or ""):
+                    array.waiting.discard(index)
+                    yield self._chunk_end(array, index, job=None)
 
     def _newly_ended(
         self, array: _Array, jobs: Mapping[tuple[str, int], _Job]
@@ -331,21 +399,23 @@ class Slurm:
         if cause is None:
             return ChunkEnd(array.chunks[index], host)
         on_host = f" on {host}" if host else ""
-        reason = self._reason(cause, job, log)
+        reason = self._reason(cause, array, job, log)
         number = job.number if job else f"{array.name}_{index}"
         text = f"job {number}{on_host} {reason}"
         return ChunkEnd(array.chunks[index], host, cause, text)
 
-    def _reason(self, cause: Cause, job: _Job | None, log: str | None) -> str:
+    def _reason(
+        self, cause: Cause, array: _Array, job: _Job | None, log: str | None
+    ) -> str:
         """Returns why a job ended, and what helps, as the end of a sentence."""
         if cause is Cause.TIME:
             return (
-                f"reached its wall time of {self._timeout_min} min; more by "
+                f"reached its wall time of {array.timeout_min} min; more by "
                 "hydra.launcher.timeout_min, or fewer runs a job by chunk"
             )
         if cause is Cause.MEMORY:
             return (
-                f"needed more than its {self._mem_gb:g} GB; more by "
+                f"needed more than its {array.mem_gb:g} GB; more by "
                 "hydra.launcher.mem_gb"
             )
         if cause is Cause.CANCELLED:
@@ -361,6 +431,21 @@ class Slurm:
         how = f" ({job.reason})" if job and job.reason else ""
         last_words = f"; its log ends: {_one_line(log)[-200:]!r}" if log.strip() else ""
         return f"died, and nobody says why{how}{last_words}"
+
+
+def has_jobs(tree: Path) -> bool:
+    """Whether jobs of a sweep's folder wait or run, as far as Slurm tells."""
+    arrays = {
+        folder.name
+        for folder in (tree / _LOGS).glob(f"{_PREFIX}*")
+        if not (folder / _ENDED).exists()
+    }
+    if not arrays or shutil.which("squeue") is None:
+        return False
+    return any(
+        name in arrays and job.state not in _ENDED_STATES
+        for (name, _), job in (_queue() or {}).items()
+    )
 
 
 def _option(key: str, value: Any) -> list[str]:
@@ -411,7 +496,7 @@ def _sbatch(options: Sequence[str], script: str, name: str) -> str:
         The number of its job.
 
     Raises:
-        GpmpcError: Slurm refuses it, or stays busy.
+        Refused: Slurm refuses it, or stays busy.
     """
     command = ["sbatch", "--parsable", *options]
     waits = iter(_WAITS)
@@ -423,7 +508,7 @@ def _sbatch(options: Sequence[str], script: str, name: str) -> str:
                 return job.number.partition("_")[0]
         wait = next(waits, None)
         if wait is None or not _BUSY.search(answer.stderr):
-            raise GpmpcError(f"Slurm refuses the sweep: {_one_line(answer.stderr)}")
+            raise Refused(f"Slurm refuses the sweep: {_one_line(answer.stderr)}")
         time.sleep(wait)
         if jobs is not None:  # else it may have taken it, and is asked once more
             answer = _run(command, script=script)
@@ -432,12 +517,20 @@ def _sbatch(options: Sequence[str], script: str, name: str) -> str:
 
 def _queue() -> dict[tuple[str, int], _Job] | None:
     """Returns this user's jobs by array's name and index; None if Slurm is silent."""
+    answer = _squeue()
+    return None if answer.returncode else _jobs_of(answer.stdout)
+
+
+def _squeue() -> subprocess.CompletedProcess[str]:
+    """Asks for this user's jobs."""
     command = ["squeue", "--me", "--array", "--noheader", "--states=all"]
-    answer = _run([*command, f"--format={_FORMAT}"])
-    if answer.returncode:
-        return None
+    return _run([*command, f"--format={_FORMAT}"])
+
+
+def _jobs_of(listing: str) -> dict[tuple[str, int], _Job]:
+    """Returns the jobs that squeue lists, by array's name and index."""
     jobs = {}
-    for line in answer.stdout.splitlines():
+    for line in listing.splitlines():
         name, index, *job = line.split("|")
         if name.startswith(_PREFIX) and index.isdecimal() and len(job) == 4:
             jobs[name, int(index)] = _Job(*job)
@@ -478,10 +571,22 @@ def _most_tasks() -> int:
 def _run(
     command: Sequence[str], script: str | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """Runs a command of Slurm, which may fail, with a script on its standard input."""
-    return subprocess.run(
-        command, input=script, capture_output=True, text=True, check=False
-    )
+    """Runs a command of Slurm, which may fail, with a script on its standard input.
+
+    One that does not answer in time has failed.
+    """
+    try:
+        return subprocess.run(
+            command,
+            input=script,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=_PATIENCE,
+        )
+    except subprocess.TimeoutExpired:
+        reason = f"{command[0]} timed out"
+        return subprocess.CompletedProcess(command, 1, stdout="", stderr=reason)
 
 
 def _tail(log: Path) -> str | None:

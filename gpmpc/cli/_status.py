@@ -2,6 +2,7 @@
 
 import argparse
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gpmpc.cli._commands import Result
@@ -14,14 +15,17 @@ _INTERVAL = 2.0  # between two looks [s]
 
 
 def status(arguments: argparse.Namespace) -> Result:
-    """Shows the runs until all have ended; where nobody looks on, in one line."""
+    """Shows the runs until all have ended; where nobody looks on, in one line.
+
+    As JSON, too, it is one look: what asks for data waits for them.
+    """
     from rich.console import Console
     from rich.live import Live
 
     console = Console()
-    watch = SweepWatch(arguments.tree)
+    watch = SweepWatch(arguments.tree, has_jobs=_has_jobs)
     now = watch.look()
-    if console.is_terminal:
+    if console.is_terminal and not arguments.as_json:
         with Live(_view(now), console=console, auto_refresh=False) as live:
             while now.left and now.active:
                 time.sleep(_INTERVAL)
@@ -30,6 +34,15 @@ def status(arguments: argparse.Namespace) -> Result:
     else:
         console.out(now.line(), highlight=False)
     return Result(_data(now))
+
+
+def _has_jobs(tree: Path) -> bool:
+    """Whether jobs of a sweep's folder are in a cluster's queue."""
+    if not (tree / ".slurm").is_dir():
+        return False
+    from gpmpc.cli._slurm import has_jobs
+
+    return has_jobs(tree)
 
 
 def _data(status: SweepStatus) -> dict:

@@ -63,6 +63,8 @@ def study(config: DictConfig) -> Result:
     for trial, record in failed[:_SHOWN_ERRORS]:
         labels = ", ".join(f"{key} {value}" for key, value in trial.labels.items())
         lines.append(f"{word}: {labels}: {record['error']}")
+    if len(failed) > _SHOWN_ERRORS:
+        lines.append(f"{word}: {len(failed) - _SHOWN_ERRORS} more; see {folder}")
     console.out(*lines, sep="\n", highlight=False)
     all_failed = len(failed) == len(records)
     failed_as_a_whole = bool(failed) and (all_failed or not published.lost_is_result)

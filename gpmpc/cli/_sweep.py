@@ -32,7 +32,7 @@ from gpmpc.cli._composing import Composer
 from gpmpc.cli._examples import Examples, try_settings
 from gpmpc.cli._flying import Flying
 from gpmpc.cli._folders import folder_of, write_files
-from gpmpc.cli._launchers import launcher_of
+from gpmpc.cli._launchers import Refused, launcher_of
 from gpmpc.cli._overrides import choices, combinations
 from gpmpc.cli._plain_settings import plain_settings
 from gpmpc.cli._settings import search_options
@@ -45,6 +45,7 @@ from gpmpc.studies._run_folder import (
     RunFolder,
     RunState,
     folder_name,
+    lock_held,
     of_other_code,
 )
 from gpmpc.studies._run_record import READ_ERRORS, warning_of
@@ -332,12 +333,18 @@ def sweep(arguments: Namespace) -> Result:
         jobs = _distinct(map(runs.job, itertools.chain([first], every_run)))
         finished_before = sum(job.folder.finished for job in jobs)
         runs.check(jobs)
-        _write_plan(runs.tree, jobs, search_options(runs.config.hydra))
+        plan = _write_plan(runs.tree, jobs, search_options(runs.config.hydra))
         try:
-            with runs.progress(jobs, len(jobs)):
+            # ``gpmpc status`` sees by the lock that the sweep is alive.
+            with lock_held(plan), runs.progress(jobs, len(jobs)):
                 outcomes = runs.fly(jobs)
         except OSError as error:
-            return _cannot_go_on(runs.tree, error)
+            place = error.filename or runs.tree
+            return cannot_go_on(runs.tree, f"{place}: {error.strerror or error}")
+        except Refused as error:
+            if not error.has_launched:
+                raise
+            return cannot_go_on(runs.tree, str(error))
     end = _end_of(jobs, outcomes, finished_before)
     text = f"{end.line()}{_count_warnings(runs.warnings)}; in {runs.tree}"
     console.out(text, highlight=False)
@@ -361,10 +368,8 @@ def print_failed(outcomes: Iterable[JobOutcome]) -> None:
         print_error(f"failed: {outcome.folder}: {outcome.error}")
 
 
-def _cannot_go_on(tree: Path, error: OSError) -> Result:
+def cannot_go_on(tree: Path, reason: str) -> Result:
     """Says that the command cannot go on, such as where a disk is full."""
-    place = error.filename or tree
-    reason = f"{place}: {error.strerror or error}"
     print_error(
         f"{reason}; the sweep ended before its runs did, and the same command goes on "
         "where it stopped"
@@ -421,18 +426,20 @@ def _end_of(
     )
 
 
-def _write_plan(tree: Path, jobs: Sequence[Job], options: Sequence[str]) -> None:
+def _write_plan(tree: Path, jobs: Sequence[Job], options: Sequence[str]) -> Path:
     """Writes what was asked for, so that a report knows what is missing.
 
-    Equal sweeps write the same file. ``options`` are those of the command by which its
-    settings are found.
+    Equal sweeps write the same file, which is returned. ``options`` are those of the
+    command by which its settings are found.
     """
     content: dict[str, Any] = {"runs": [job.choices for job in jobs]}
     if options:
         content["search_options"] = shlex.join(options)
     plan = json.dumps(content, indent=1) + "\n"
     digest = hashlib.sha256(plan.encode()).hexdigest()
-    write_files(tree, {f"{PLAN_PREFIX}{digest[:10]}.json": plan})
+    name = f"{PLAN_PREFIX}{digest[:10]}.json"
+    write_files(tree, {name: plan})
+    return tree / name
 
 
 def _count_warnings(warnings: Mapping[Path, str]) -> str:

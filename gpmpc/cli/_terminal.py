@@ -18,6 +18,13 @@ if TYPE_CHECKING:
 _SEARCH = "gpmpc.gp._search"
 
 
+class OutputEnded(SystemExit):
+    """The standard output takes nothing any more, and the command ends.
+
+    It is no error: nothing on the way may take it for one of a file.
+    """
+
+
 class Output:
     """A stream that ends the command where nothing can be written to it any more."""
 
@@ -48,7 +55,7 @@ class Output:
                     print_error(
                         f"cannot write to the standard output: {error.strerror}"
                     )
-            sys.exit(1)  # no error: nothing on the way may take it for one of a file
+            raise OutputEnded(1) from None
 
 
 @contextmanager

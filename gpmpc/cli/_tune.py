@@ -23,9 +23,11 @@ from gpmpc.cli._commands import Result
 from gpmpc.cli._composing import ComposedSettings
 from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import write_files
+from gpmpc.cli._launchers import Refused
 from gpmpc.cli._overrides import choices, is_shared
 from gpmpc.cli._settings import run_command, search_options, without_hydra
-from gpmpc.cli._sweep import JobOutcome, Sweep, print_failed
+from gpmpc.cli._sweep import JobOutcome, Sweep, cannot_go_on, print_failed
+from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, check_number
 from gpmpc.metrics import tracking_cost
 from gpmpc.recording import read_run
@@ -106,7 +108,7 @@ def tune(arguments: Namespace) -> Result:
 
     Returns:
         The best candidate; the exit code is 1 where flights failed, whose cost is
-        infinite.
+        infinite, or where no candidate has a finite cost.
     """
     for key in ("trials", "batch", "seeds"):
         check_number(f"--{key}", getattr(arguments, key), least=1, whole=True)
@@ -116,17 +118,27 @@ def tune(arguments: Namespace) -> Result:
     tuning = Tuning(runs, fixed, arguments.seeds)
     search = Search(space, runs.config.seed)
     total = (arguments.trials + 1) * arguments.seeds
-    with closing(runs), runs.progress(tuning.jobs, total) as describe:
-        (unchanged_cost,) = tuning.costs([{}])
-        for start in range(0, arguments.trials, arguments.batch):
-            candidates = search.ask(min(arguments.batch, arguments.trials - start))
-            search.tell(tuning.costs(candidates))
-            describe(f"flying; least cost {search.costs[search.best]:.4g}")
+    try:
+        with closing(runs), runs.progress(tuning.jobs, total) as describe:
+            (unchanged_cost,) = tuning.costs([{}])
+            for start in range(0, arguments.trials, arguments.batch):
+                candidates = search.ask(min(arguments.batch, arguments.trials - start))
+                search.tell(tuning.costs(candidates))
+                describe(f"flying; least cost {search.costs[search.best]:.4g}")
+    except Refused as error:
+        is_first_batch = len(tuning.jobs) <= tuning.seeds
+        if is_first_batch and not error.has_launched:
+            raise
+        return cannot_go_on(runs.tree, str(error))
     print_failed(tuning.failed)
     best = search.candidates[search.best]
     least_cost = search.costs[search.best]
     if not math.isfinite(least_cost):
-        raise GpmpcError(f"tune: every flight was lost or failed; see {runs.tree}")
+        reason = f"every candidate was lost or failed; see {runs.tree}"
+        print_error(f"tune: {reason}")
+        failed = [each._asdict() for each in tuning.failed]
+        data = {"folder": str(runs.tree), "error": reason, "failed": failed}
+        return Result(data, 1)
     words = [*choices(tuning.overrides(best)), folder_override(runs.tree / "best")]
     command = run_command(search_options(runs.config.hydra), words)
     base_cost = unchanged_cost if math.isfinite(unchanged_cost) else None

@@ -9,7 +9,7 @@ did meanwhile is no property of either.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -50,8 +50,10 @@ class Comparison:
     #: mean over standard deviation of the differences (Cohen's d_z)
     standardised: float
     pairs: int
-    #: seeds and other settings of which A or B lacks runs
+    #: seeds and other settings of which A or B lacks runs, or numbers
     left_out: tuple[str, ...] = ()
+    #: flights of A and of B that were lost and have no number; not among the pairs
+    lost: tuple[int, int] = (0, 0)
 
     @property
     def verdict(self) -> str:
@@ -66,10 +68,16 @@ class Comparison:
                 "undecided: every seed gave the same, so all are one; "
                 "vary what the seed draws (data.size, noise)"
             )
-        if self.wilcoxon < _LEVEL:
-            relation = "larger" if self.rank_biserial > 0 else "smaller"
-            return f"A is {relation} than B"
-        return "no difference shown"
+        if not self.wilcoxon < _LEVEL:
+            return "no difference shown"
+        a_is_larger = self.rank_biserial > 0
+        relation = "larger" if a_is_larger else "smaller"
+        lost_of_a, lost_of_b = self.lost
+        # Pairs are survivors: their numbers say nothing for who lost more flights.
+        lost_more = lost_of_a < lost_of_b if a_is_larger else lost_of_a > lost_of_b
+        if lost_more:
+            return f"undecided: A is {relation} than B only where neither was lost"
+        return f"A is {relation} than B"
 
 
 def compare(report: Report, a: str, b: str) -> list[Comparison]:
@@ -92,8 +100,8 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
     if len(units) > 1:
         raise SettingError(
             "compare",
-            "errors in m and in rad have no common mean; "
-            "add subsystem=... to both groups",
+            f"errors in {' and in '.join(sorted(units))} have no common mean; "
+            "compare runs of one system: add system=... to both groups",
         )
     comparisons = []
     for measure in report.measures:
@@ -108,7 +116,12 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         mean_of_a = _mean_by_seed(values_of_a, complete)
         mean_of_b = _mean_by_seed(values_of_b, complete)
         if len(mean_of_a) >= 2:
-            comparisons.append(_test(measure, mean_of_a, mean_of_b, left_out))
+            comparison = _test(measure, mean_of_a, mean_of_b, left_out)
+            lost = (
+                _lost_without(runs_of_a, measure),
+                _lost_without(runs_of_b, measure),
+            )
+            comparisons.append(replace(comparison, lost=lost))
     if not comparisons:
         raise DataError(
             f"{report.tree}: runs of {a} and {b} have fewer than two seeds in common"
@@ -135,6 +148,11 @@ def _runs_of_group(report: Report, group: str, text: str) -> pd.DataFrame:
     is_finished = report.runs.state == "finished"
     runs = report.runs[is_finished & report.runs.cell.isin(others)]
     return runs.assign(others=runs.cell.map(others), seed=f"{SEED}=" + runs.seed)
+
+
+def _lost_without(runs: pd.DataFrame, measure: str) -> int:
+    """Counts the lost flights that have no number of a measure: those that diverged."""
+    return int((runs[measure].isna() & (runs.lost != "")).sum())
 
 
 def _parse_choice(report: Report, group: str, choice: str) -> tuple[str, str]:
@@ -249,6 +267,12 @@ def sentences(
         names = "; ".join(left_out_of_all)
         head += f" Left out, since A or B lacks runs of it: {names}."
     lines = [head]
+    compared = {comparison.measure for comparison in comparisons}
+    lines += [
+        f"{label}: undecided: fewer than two pairs have a number"
+        for measure, label in report.measures.items()
+        if measure not in compared and measure not in _WALL_TIMES
+    ]
     for comparison in comparisons:
         line = _sentence(report.measures[comparison.measure], comparison)
         others = [name for name in comparison.left_out if name not in left_out_of_all]
@@ -275,4 +299,6 @@ def _sentence(label: str, comparison: Comparison) -> str:
             f"paired t-test p = {c.t_test:.3g}, d_z {c.standardised:.2f}",
         ]
     parts.append(f"n = {c.pairs}")
+    if any(c.lost):
+        parts.append(f"lost, without a number: {c.lost[0]} of A, {c.lost[1]} of B")
     return "; ".join(parts)

@@ -88,7 +88,7 @@ class RunFolder:
             return RunState.FINISHED
         if (self.path / ERROR).exists():
             return RunState.FAILED
-        if self._has_living_lock():
+        if is_locked(self.path / _LOCK):
             return RunState.RUNNING
         # It may have ended between the looks.
         if self.finished:
@@ -98,21 +98,6 @@ class RunFolder:
         if (self.path / CONFIG).exists():
             return RunState.LOST
         return RunState.NOT_BEGUN
-
-    def _has_living_lock(self) -> bool:
-        """Whether a process holds the lock; takes it for a moment where none does."""
-        try:
-            file = os.open(self.path / _LOCK, os.O_RDWR)
-        except FileNotFoundError:
-            return False
-        except OSError as error:
-            if error.errno not in _NOT_WRITABLE:
-                raise
-            return _is_locked_by_others(self.path / _LOCK)
-        try:
-            return not lock_descriptor(file, blocking=False)
-        finally:
-            os.close(file)
 
     @property
     def last_worker(self) -> str:
@@ -296,6 +281,33 @@ class RunFolder:
                 "choose another folder, or remove that one to fly it again",
             )
         return content
+
+
+def is_locked(path: Path) -> bool:
+    """Whether a process holds a file's lock; takes it for a moment where none does."""
+    try:
+        file = os.open(path, os.O_RDWR)
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        if error.errno not in _NOT_WRITABLE:
+            raise
+        return _is_locked_by_others(path)
+    try:
+        return not lock_descriptor(file, blocking=False)
+    finally:
+        os.close(file)
+
+
+@contextmanager
+def lock_held(path: Path) -> Iterator[None]:
+    """Holds the lock of a file inside, unless another process does."""
+    file = os.open(path, os.O_RDWR)
+    try:
+        _lock_soon(file)
+        yield
+    finally:
+        os.close(file)
 
 
 def _is_locked_by_others(path: Path) -> bool:

@@ -11,7 +11,7 @@ import os
 import re
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,10 +26,11 @@ from gpmpc.studies._run_folder import (
     RunFolder,
     RunState,
     folder_name,
+    is_locked,
 )
 
 _RATE_WINDOW = 600.0  # ends that tell how fast runs end now [s]
-# Behind the last end, after which nobody works, where no lock is held [s].
+# Behind the last end, after which nobody works, where no run or plan is locked [s].
 _STILL = 60.0
 _SHOWN_REASONS = 3
 
@@ -114,12 +115,15 @@ class SweepWatch:
 
     Args:
         tree: A sweep's folder, or one with sweeps below it.
+        has_jobs: Whether jobs of a sweep's folder wait or run in a queue; asked where
+            nothing in the folder shows that anybody works on it.
 
     Raises:
         DataError: There is no such folder, or no sweep and no run in it.
     """
 
     tree: Path
+    has_jobs: Callable[[Path], bool] = lambda _: False
     _reasons: dict[str, tuple[int, str]] = field(default_factory=dict)  # by path
     _plans: dict[str, tuple[int, set[str]]] = field(default_factory=dict)  # by path
 
@@ -131,7 +135,8 @@ class SweepWatch:
         ends: list[float] = []
         failures: Counter[str] = Counter()
         examples: dict[str, str] = {}
-        for folder in _sweeps(str(self.tree)):
+        sweeps = [*_sweeps(str(self.tree))]
+        for folder in sweeps:
             for path, state, ended in self._runs(folder):
                 counts[state] += 1
                 if ended is None:
@@ -145,11 +150,19 @@ class SweepWatch:
         if not any(counts.values()):
             raise DataError(f"{self.tree}: holds no sweep, and no run")
         rate, last_end = _rate(ends)
+        is_active = (
+            counts[RunState.RUNNING] > 0
+            or abs(time.time() - last_end) < _STILL
+            or any(
+                is_locked(Path(plan)) for folder in sweeps for plan in _plans(folder)
+            )
+            or any(self.has_jobs(Path(folder)) for folder in sweeps)
+        )
         return SweepStatus(
             counts=counts,
             failures={examples[kind]: n for kind, n in failures.most_common()},
             rate=rate,
-            active=counts[RunState.RUNNING] > 0 or abs(time.time() - last_end) < _STILL,
+            active=is_active,
         )
 
     def _runs(self, folder: str) -> Iterator[tuple[str, RunState, int | None]]:

@@ -24,7 +24,15 @@ from threadpoolctl import threadpool_limits
 
 from gpmpc._compiling import report_compilation
 from gpmpc._provenance import code_fingerprint, own_code
-from gpmpc.exceptions import GpmpcError, SettingError
+from gpmpc.exceptions import (
+    Diverged,
+    GpmpcError,
+    ProblemError,
+    SettingError,
+    SolverFailure,
+    TrainingError,
+    UnsupportedModel,
+)
 from gpmpc.gp import Training, Transitions
 from gpmpc.models import DynamicsModel, load_model, save_model
 from gpmpc.parallel import in_processes
@@ -33,6 +41,15 @@ from gpmpc.studies._document import Document, Table
 __all__ = ["Study", "TrialSpec", "TrialStore", "run_study"]
 
 _LinAlgError = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
+# Errors that settings, data and code alone decide: they come again.
+_RESULTS = (
+    Diverged,
+    ProblemError,
+    SolverFailure,
+    TrainingError,
+    UnsupportedModel,
+    _LinAlgError,
+)
 
 
 @dataclass(frozen=True)
@@ -94,7 +111,9 @@ def run_study(
 
     Args:
         run_trial: From a trial to plain data. What it raises as a ``GpmpcError``, or of
-            linear algebra, is the trial's ``error``; the others go on.
+            linear algebra, is the trial's ``error``; the others go on. One that its
+            settings and code decide is kept; a trial that failed for another reason,
+            such as a full disk or a library that is missing, is run again next time.
         trials: All of the study.
         store: Where records are kept.
         workers: Processes; None takes one a core.
@@ -113,29 +132,40 @@ def run_study(
         else:
             missing[trial.fingerprint] = trial
     jobs = list(missing.values())
+    not_kept: dict[str, dict] = {}
     run = partial(_run_in_worker, run_trial)
     try:
         with closing(in_processes(run, jobs, workers)) as finished:
-            for index, record in finished:
-                store.append(jobs[index].fingerprint, record)
+            for index, (record, is_result) in finished:
+                if is_result:
+                    store.append(jobs[index].fingerprint, record)
+                else:
+                    not_kept[jobs[index].fingerprint] = record
                 progress(record)
     except BrokenProcessPool as error:
         raise GpmpcError(
             "a worker process died (out of memory?); "
             "the same command goes on where it stopped"
         ) from error
-    return [store.records[trial.fingerprint] | dict(trial.labels) for trial in trials]
+    records = store.records | not_kept
+    return [records[trial.fingerprint] | dict(trial.labels) for trial in trials]
 
 
 @report_compilation()
-def _run_in_worker(run_trial: RunTrial, trial: TrialSpec) -> dict[str, Any]:
-    """Runs one trial in a worker process; returns its record."""
+def _run_in_worker(
+    run_trial: RunTrial, trial: TrialSpec
+) -> tuple[dict[str, Any], bool]:
+    """Runs one trial in a worker process.
+
+    Returns:
+        Its record, and whether it would be the same if the trial were run again.
+    """
     record = {**trial.labels, "seed": trial.seed}
     try:
         with one_thread():
-            return record | run_trial(trial)
+            return record | run_trial(trial), True
     except (GpmpcError, _LinAlgError) as error:
-        return record | {"error": str(error)}
+        return record | {"error": str(error)}, isinstance(error, _RESULTS)
 
 
 class TrialStore:

@@ -14,6 +14,7 @@ from gpmpc.cli import _flying
 from gpmpc.cli._flying import Flying
 from gpmpc.cli._launchers import Basic, Cause, ChunkEnd, Joblib
 from gpmpc.exceptions import SettingError
+from gpmpc.studies import _run_folder
 from gpmpc.studies._run_folder import RunFolder, RunState
 from tests.cli.launched import Chunk, fly, in_chunks, jobs_of
 
@@ -198,16 +199,16 @@ def test_a_run_in_the_hands_of_another_sweep_is_waited_for(tmp_path, monkeypatch
     looks = []
     with jobs[0].folder.locked():
         jobs[0].folder.begin("act: 1\n")
-        usual = RunFolder._has_living_lock
+        usual = _run_folder.is_locked
 
-        def looked(folder):
-            if folder == jobs[0].folder:
-                looks.append(folder)
+        def looked(lock):
+            if lock.parent == jobs[0].folder.path:
+                looks.append(lock)
             if len(looks) == 3:
                 jobs[0].folder.finish({"settings": {}})
-            return usual(folder)
+            return usual(lock)
 
-        monkeypatch.setattr(RunFolder, "_has_living_lock", looked)
+        monkeypatch.setattr(_run_folder, "is_locked", looked)
         launcher = Told(tmp_path)
         _, states = flown(launcher, jobs)
     assert states == {"0-flies": "finished", "1-flies": "finished"}

@@ -12,6 +12,7 @@ from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import writing
 from gpmpc.cli._run import RunToFly, run_one
 from gpmpc.cli._settings import compose, settings_folders
+from gpmpc.cli._terminal import OutputEnded
 from gpmpc.exceptions import SettingError
 from gpmpc.mpc import Box
 from gpmpc.recording import read_run
@@ -61,6 +62,17 @@ def test_a_live_flight_again_is_finished_when_it_has_ended(tmp_path, monkeypatch
     assert "it ended early" in run_one(live).error
     assert folder.state is RunState.FAILED
     assert during == [RunState.RUNNING] * 4
+
+
+def test_a_reader_that_has_seen_enough_makes_no_failed_run(tmp_path, monkeypatch):
+    def fly(*_):
+        raise OutputEnded(1)
+
+    monkeypatch.setattr(_run, "_fly", fly)
+    run = to_fly(tmp_path)
+    with pytest.raises(OutputEnded):
+        run_one(run)
+    assert run.folder.state is RunState.LOST
 
 
 def test_a_model_that_cannot_be_read_is_no_fault_of_the_folder(tmp_path):

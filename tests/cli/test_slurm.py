@@ -14,7 +14,7 @@ import pytest
 from gpmpc.cli import _flying, _slurm
 from gpmpc.cli._flying import Flying
 from gpmpc.cli._settings import settings_folders
-from gpmpc.cli._slurm import Slurm
+from gpmpc.cli._slurm import Slurm, has_jobs
 from gpmpc.exceptions import GpmpcError, SettingError
 from tests.cli.launched import fly, in_chunks, jobs_of
 
@@ -22,6 +22,8 @@ from tests.cli.launched import fly, in_chunks, jobs_of
 # and what stands in `logs` is there as soon as an array has been submitted.
 SBATCH = """#!/bin/sh
 [ -e "$FAKE/refusal" ] && { cat "$FAKE/refusal" >&2; exit 1; }
+[ -e "$FAKE/full" ] && [ -e "$FAKE/submitted" ] && {
+  rm "$FAKE/full"; echo "sbatch: error: QOSMaxSubmitJobPerUserLimit" >&2; exit 1; }
 busy=
 [ -e "$FAKE/busy" ] && { busy=$(cat "$FAKE/busy"); rm "$FAKE/busy"; }
 [ "$busy" = refuses ] && { echo "Unable to contact slurm controller" >&2; exit 1; }
@@ -37,6 +39,7 @@ echo 7
 """
 SQUEUE = """#!/bin/sh
 [ -e "$FAKE/silent" ] && { rm "$FAKE/silent"; exit 1; }
+[ -e "$FAKE/broken" ] && { echo "squeue: unrecognized option '--me'" >&2; exit 1; }
 for name in $(cat "$FAKE/names"); do
   while IFS='|' read -r index rest; do
     echo "$name|$index|7_$index|$rest"
@@ -254,7 +257,7 @@ def test_a_job_flies_its_chunk_and_says_so(fake, tree):
 
 def test_the_jobs_of_a_killed_sweep_are_watched_and_not_flown_twice(fake, tree):
     jobs = jobs_of(tree, "flies", "flies", "flies")
-    killed = Slurm(tree)
+    killed = Slurm(tree, timeout_min=5)
     killed.launch(fly, in_chunks(1)(jobs[:2]))
     (fake / "queue").write_text("0|RUNNING|None|n1\n1|PENDING|Resources|\n")
     again = Slurm(tree)
@@ -267,8 +270,42 @@ def test_the_jobs_of_a_killed_sweep_are_watched_and_not_flown_twice(fake, tree):
     (fake / "logs" / "0.log").write_text("")
     states = outcomes(tree, jobs, flown_before=["2-flies"])
     assert states == ["finished", "failed", "finished"]
+    # the limit is that of the call that submitted it
+    assert "wall time of 5 min" in jobs[1].folder.error()
     assert len((fake / "submitted").read_text().splitlines()) == 2
     assert Slurm(tree).running(paths) == []
+
+
+def test_chunks_of_another_gpmpc_are_told_and_left(fake, tree, capsys):
+    (job,) = jobs_of(tree, "flies")
+    Slurm(tree).launch(fly, in_chunks(1)([job]))
+    assert not has_jobs(tree)
+    (fake / "queue").write_text("0|PENDING|Resources|\n")
+    assert has_jobs(tree)
+    (chunks,) = tree.glob(".slurm/*/chunks")
+    chunks.write_bytes(b"cgpmpc.cli._slurm\nGone\n.")
+    assert Slurm(tree).running({str(job.folder.path)}) == []
+    assert f"scancel -n {chunks.parent.name}" in capsys.readouterr().err
+
+
+def test_what_slurm_refuses_behind_others_is_submitted_later(fake, tree, capsys):
+    (fake / "full").touch()
+    (fake / "queue").write_text("0|COMPLETED|None|n1\n1|COMPLETED|None|n1\n")
+    jobs = jobs_of(tree, "flies", "flies", "flies")
+    names = [job.folder.path.name for job in jobs]
+    assert outcomes(tree, jobs, flown_before=names) == 3 * ["finished"]
+    assert "QOSMaxSubmitJobPerUserLimit; what it has taken" in capsys.readouterr().err
+
+
+def test_without_a_queue_the_logs_tell_which_jobs_are_done(
+    fake, tree, monkeypatch, capsys
+):
+    monkeypatch.setattr(_slurm, "_SILENCE", 0.0)
+    (fake / "broken").touch()
+    (fake / "logs" / "0.log").write_text("gpmpc: done on n1\n")
+    (job,) = jobs_of(tree, "flies")
+    assert outcomes(tree, [job], flown_before=["0-flies"]) == ["finished"]
+    assert "unrecognized option '--me'" in capsys.readouterr().err
 
 
 def test_what_was_never_submitted_is_no_job(fake, tree):

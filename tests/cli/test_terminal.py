@@ -12,6 +12,7 @@ import subprocess
 import sys
 import termios
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -19,7 +20,8 @@ from gpmpc.cli import _main
 from gpmpc.cli._commands import COMMANDS
 from gpmpc.cli._completion import candidates
 from gpmpc.cli._run import _was_interrupted
-from gpmpc.cli._terminal import Output
+from gpmpc.cli._terminal import Output, OutputEnded
+from gpmpc.exceptions import GpmpcError
 from tests.cli.command import PATH, SECONDS, forked
 
 TINY = ["data.samples=25", "model.restarts=0", "steps=2", "horizon=1", "recorder=none"]
@@ -51,6 +53,19 @@ def test_a_full_standard_output_ends_the_command_in_one_line(command, tmp_path):
         (1, ""),
         (0, ""),
     )  # all may have been written before true ended
+
+
+def test_code_of_the_user_s_that_ends_the_process_is_a_mistake(monkeypatch):
+    """Where the output takes nothing any more, that is no fault of the run."""
+
+    def end(error):
+        raise error
+
+    monkeypatch.setattr(_main, "import_module", lambda _: SimpleNamespace(calls=end))
+    with pytest.raises(GpmpcError, match=r"ended the process \(exit None\)"):
+        _main._call("any", "calls", SystemExit())
+    with pytest.raises(OutputEnded):
+        _main._call("any", "calls", OutputEnded(1))
 
 
 def test_closed_streams_and_those_of_other_letters_do_no_harm(tmp_path):
@@ -172,6 +187,8 @@ def test_standard_output_holds_only_json_and_nothing_if_quiet(tmp_path):
         == result["rmse"]
     )
     assert "RMSE [m]" in flown.stderr
+    as_data = forked(*run, "--quiet", "--json", cwd=tmp_path)
+    assert (json.loads(as_data.stdout)["steps"], as_data.stderr) == (2, "")
     quiet = forked(*run, "--quiet", cwd=tmp_path)
     assert (quiet.returncode, quiet.stdout, quiet.stderr) == (0, "", "")
     wrong = forked("run", "horizn=1", "--quiet", cwd=tmp_path)

@@ -90,13 +90,16 @@ def test_a_search_resumes_and_its_best_settings_fly(tmp_path):
     assert json.loads(again.stdout)["rmse"]["total"] in totals
 
 
-def test_flights_that_failed_are_told_and_cost_no_number(tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("some_fly", [True, False])
+def test_flights_that_failed_are_told_and_cost_no_number(
+    some_fly, tmp_path, monkeypatch, capsys
+):
     def fly(sweep, jobs):
         failing = [job for job in jobs if "horizon=1" in job.choices]
         return [JobOutcome(str(job.folder.path), "its process died") for job in failing]
 
     def cost(job, controller):
-        return math.inf if "horizon=1" in job.choices else 1.0
+        return 1.0 if some_fly and "horizon=1" not in job.choices else math.inf
 
     monkeypatch.setattr(Sweep, "fly", fly)
     monkeypatch.setattr(_tune, "_cost", cost)
@@ -111,8 +114,12 @@ def test_flights_that_failed_are_told_and_cost_no_number(tmp_path, monkeypatch, 
         result = _tune.tune(arguments)
     (failed,) = result.data["failed"]
     said = capsys.readouterr().err.splitlines()
-    assert said == [f"gpmpc: failed: {failed['folder']}: its process died"]
+    assert said[0] == f"gpmpc: failed: {failed['folder']}: its process died"
     assert result.code == 1
+    if not some_fly:
+        assert said[1:] == [f"gpmpc: tune: {result.data['error']}"]
+        return
+    assert len(said) == 1
     told = json.loads(json_text(result.data), parse_constant=pytest.fail)
     assert (told["unchanged"], told["cost"]) == (None, 1.0)
 

@@ -9,7 +9,7 @@ from scipy import stats
 
 from gpmpc.exceptions import DataError
 from gpmpc.studies.report import compare, read_report, sentences
-from tests.studies.made_up import made_up_run, metrics_of
+from tests.studies.made_up import chosen, made_up_run, metrics_of
 
 SETTINGS = {
     "data": {"size": None},
@@ -95,6 +95,23 @@ def test_a_verdict_is_given_below_five_percent_and_not_above(tmp_path):
         pytest.approx(4 / 64),
         "no difference shown",
     )
+
+
+def test_survivors_alone_make_no_group_the_better_one(tmp_path):
+    for seed in range(10):
+        lost = {"rmse": {"total": None}, "lost": {"step": 3}} if seed > 5 else {}
+        smaller = metrics_of(0.1 + 1e-3 * seed) | lost
+        made_up_run(tmp_path, *chosen("lqr", seed), result=smaller)
+        fly(tmp_path, "convex", seed, 0.2)
+    report = read_report(tmp_path)
+    comparisons = compare(report, *GROUPS)
+    rmse = next(c for c in comparisons if c.measure == "rmse")
+    assert (rmse.pairs, rmse.lost) == (6, (4, 0))
+    assert rmse.verdict == "undecided: A is smaller than B only where neither was lost"
+    text = "\n".join(sentences(report, comparisons, *GROUPS))
+    assert "lost, without a number: 4 of A, 0 of B" in text
+    turned = compare(report, *GROUPS[::-1])
+    assert next(c for c in turned if c.measure == "rmse").verdict.startswith("undec")
 
 
 def test_groups_without_two_seeds_in_common_are_refused(tmp_path):

@@ -12,7 +12,7 @@ import pytest
 import torch
 from threadpoolctl import threadpool_info
 
-from gpmpc.exceptions import GpmpcError, SettingError
+from gpmpc.exceptions import GpmpcError, SettingError, TrainingError
 from gpmpc.gp import Trainer, Transitions
 from gpmpc.studies import study as studied
 from gpmpc.studies.study import (
@@ -61,7 +61,9 @@ def test_a_record_is_on_the_disk_when_it_is_kept(tmp_path, monkeypatch):
 
 def fail(trial):
     if trial.condition == "bad":
-        raise GpmpcError("no luck")
+        raise TrainingError([0], "no luck")
+    if trial.condition == "without a library":
+        raise SettingError("model", "needs a library")
     if trial.condition == "singular":
         raise torch.linalg.LinAlgError("not positive definite")
     return {"square": trial.seed**2, "threads": torch.get_num_threads()}
@@ -110,6 +112,15 @@ def test_missing_trials_run_and_records_keep_their_order(tmp_path, started):
     )
     assert [record["seed"] for record in again] == [3, 4, 5, 6]
     assert len(started) == 3
+
+
+def test_a_trial_that_failed_by_its_surroundings_is_run_again(tmp_path, started):
+    trials = [TrialSpec({}, "without a library", seed=0, fingerprint="a")]
+    for _ in range(2):
+        store = TrialStore(tmp_path / "trials.jsonl")
+        (record,) = run_study(fail, trials, store, 1)
+        assert "needs a library" in record["error"]
+    assert len(started) == 2
 
 
 def test_other_errors_end_the_study_and_dead_workers_are_named(

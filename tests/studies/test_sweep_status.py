@@ -3,11 +3,13 @@
 import json
 import os
 import time
+from argparse import Namespace
 
 import pytest
 
+from gpmpc.cli._status import status
 from gpmpc.exceptions import DataError
-from gpmpc.studies._run_folder import PLAN_PREFIX, RunFolder, RunState
+from gpmpc.studies._run_folder import PLAN_PREFIX, RunFolder, RunState, lock_held
 from gpmpc.studies._sweep_status import SweepStatus, SweepWatch
 from tests.studies.made_up import plan
 
@@ -92,6 +94,16 @@ def test_nobody_works_on_a_sweep_that_was_stopped(ago, tmp_path):
     assert (
         status.line() == "2 runs: 1 finished, 0 failed, 1 to fly; nobody works on them"
     )
+    assert SweepWatch(tmp_path, has_jobs=lambda _: True).look().active
+    with lock_held(tmp_path / f"{PLAN_PREFIX}0.json"):
+        assert SweepWatch(tmp_path).look().active
+
+
+def test_who_asks_for_data_does_not_wait_for_the_end(tree, monkeypatch):
+    monkeypatch.setattr("rich.console.Console.is_terminal", True)
+    monkeypatch.setattr(time, "sleep", lambda _: pytest.fail("it waits"))
+    result = status(Namespace(tree=tree, as_json=True))
+    assert result.data["running"] == 0
 
 
 def test_sweeps_below_a_folder_are_counted_together(tree):
