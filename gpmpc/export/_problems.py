@@ -171,7 +171,7 @@ def tables(controller: GPMPC, numbers: Numbers) -> str:
     prediction = controller.prediction
     problem = controller.problem
     cost = prediction.costs.quadratic
-    limits = prediction.limits
+    limits = prediction.roll_out_bounds
     rows = prediction.constraints.linear
     table = numbers.table
     parts = [

@@ -226,11 +226,13 @@ class Decision:
     stage_costs: Array = field(default_factory=lambda: np.empty(0))
     #: by how much the plan misses a bound, in the bound's unit: smooth constraints are
     #: taken at its means; soft ones may be missed. Zero but for rounding where all are
-    #: kept; NaN where that is not known
+    #: kept; NaN where that is not known. Up to 1e-5 a bound counts as kept: state
+    #: bounds in units in which that is little
     violation: float = math.nan
     #: lengths of the steps that its programs took, squared in the metric of the cost:
-    #: by them the next decision tells a jump. Empty after a first plan of one program
-    #: and along a flight of ``ManyStarts``: then the next one takes one program
+    #: by them the next decision tells a jump. Empty after a first plan of one program,
+    #: but under smooth constraints, and along a flight of ``ManyStarts``: then the
+    #: next one takes one program
     steps: tuple[float, ...] = ()
     #: ``novelty``; or a function where no variances were computed, which is called when
     #: ``novelty`` is read
@@ -249,7 +251,8 @@ class Decision:
     def applicable(self) -> bool:
         """Whether the plan may be applied, and started from.
 
-        The inputs of a decision that is not applicable are a failed iterate.
+        The inputs of a decision that is not applicable are a failed iterate. What is
+        applied instead is the loop's policy (``gpmpc.mpc._policy``).
         """
         return self.status.solved or self.suboptimal
 
@@ -354,19 +357,19 @@ class Request(NamedTuple):
     parameters: Array | None = None  # of the smooth constraints, by stage (H, q)
     kappas: Array | None = None  # of the reference (H,), where it has some
     #: the last decision, where its plan may be started from and has this horizon
-    previous: Decision | None = None
+    last_plan: Decision | None = None
     #: a first guess of x_0 .. x_H (H + 1, n), where states or inputs were handed over
     guessed_states: Array | None = None
 
     @property
     def continues_last_plan(self) -> bool:
         """Whether the first guess is the last plan, one step on."""
-        return self.previous is not None and self.guessed_states is None
+        return self.last_plan is not None and self.guessed_states is None
 
     @property
     def starts_afresh(self) -> bool:
         """Whether there is neither a last plan nor one that was handed over."""
-        return self.previous is None and self.guessed_states is None
+        return self.last_plan is None and self.guessed_states is None
 
     @classmethod
     def read(
@@ -414,7 +417,7 @@ class Request(NamedTuple):
         m = problem.cost.R.shape[-1]
         state = _as_array(belief.mean)
         covariance = _as_array(belief.covariance)
-        finite = is_usable(state, covariance)
+        finite = is_usable_belief(state, covariance)
         targets = _read_targets(reference, state, horizon, n)
         if reference.inputs is None and problem.cost.penalized == "deviations":
             rule = f"needs reference inputs ({horizon}, {m})"
@@ -440,7 +443,7 @@ class Request(NamedTuple):
             guessed_inputs=np.minimum(np.maximum(guess, lower), upper),
             finite=finite,
             kappas=kappas,
-            previous=last_decision,
+            last_plan=last_decision,
             guessed_states=states,
         )
 
@@ -464,7 +467,7 @@ class Request(NamedTuple):
     ) -> Decision:
         """Returns the decision of a step without a usable solve.
 
-        It holds the guessed inputs, and no prediction.
+        It holds the guessed inputs, the disturbance estimate, and no prediction.
         """
         H, n = self.references.states.shape
         return Decision(
@@ -475,6 +478,7 @@ class Request(NamedTuple):
             status=status,
             iterations=iterations,
             timing=timing or Timing(),
+            disturbance=self.disturbance,
         )
 
 
@@ -680,7 +684,7 @@ def _unwrap(
     return targets + full_turns(plan - targets, angles)
 
 
-def is_usable(mean: Array, covariance: Array) -> bool:
+def is_usable_belief(mean: Array, covariance: Array) -> bool:
     """Tells whether a belief can be decided on: mean (n,) and covariance (n, n).
 
     It is finite, and its mean was measured (``gpmpc._arrays.UNMEASURED``).

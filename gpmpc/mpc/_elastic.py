@@ -17,18 +17,19 @@ its violations. A direction that the cost does not weigh counts there as its lar
 weight does, and so does one of the inputs, whose own weight says nothing of what they
 move: else a bound in it would count for nothing.
 
-This is the least price. The linearised program may promise more than the vehicle can
-do: as long as a plan that the model itself rolls out costs at most a SHARE of J0 more,
-the bound may be dearer. Of a few prices up to the exact one the highest such is taken;
-for a first plan, whose guess says little about costs, the least. It is the least, too,
-for what follows on a plan that missed such bounds by more than its program, under the
-exact price, had promised: what the program sees is not what the model does.
+This is the safe price. The linearised program may promise more than the vehicle can
+do: as long as a plan that the model itself rolls out costs at most a SHARE of
+J0 + J_move more, the bound may be dearer. Of a few prices up to the exact one the
+highest such is taken; for a first plan, whose guess says little about costs, the safe
+one. So it is for what follows on a plan that missed such bounds by more than its
+program, under the exact price, had promised: what the program sees is not what the
+model does.
 
 A detour is worth it where the bound is kept again at its end. Where violations under
 the exact price grow along the horizon, as where a model leaves its data and tubes
 become wider than the lane, it is not: paid for at every step, it has led a car away
 that came back without the lane. There the SHARE of J0 is all that the bound may cost,
-and prices below the least are among those that are tried.
+and prices below the safe one are among those that are tried.
 
 Bounds that the exact price does keep are none of these: theirs stays.
 """
@@ -48,7 +49,7 @@ WORTH = 2.0
 SHARE = 0.1
 TRIALS = 5  # prices between the lowest and the exact one
 NO_PRICE = 1e-9  # of a row that does not count: it keeps its place among the others
-_LOWEST = 2.0**-8  # of the least price, where violations grow along the horizon
+_LOWEST = 2.0**-8  # of the safe price, where violations grow along the horizon
 _TINY = 1e-12
 
 
@@ -56,14 +57,14 @@ class ElasticLimits(NamedTuple):
     """What elastic rows that cannot be kept may cost.
 
     Attributes:
-        least_price: Under which no plan outweighs what the cost is for.
-        lowest_price: Of those that are tried for a plan that goes on.
-        extra_cost: What such a plan may cost more than without them.
+        safe_price: Under which no plan outweighs what the cost is for.
+        lowest_trial_price: Of those that are tried for a plan that goes on.
+        affordable_extra_cost: What such a plan may cost more than without them.
     """
 
-    least_price: float
-    lowest_price: float
-    extra_cost: float
+    safe_price: float
+    lowest_trial_price: float
+    affordable_extra_cost: float
 
 
 def elastic_limits(
@@ -105,18 +106,18 @@ def elastic_limits(
     lengths = np.where(squares > 0.0, squares, 1.0)
     moving_cost = (weights / lengths**2 * missed**2).sum()
     cost = min(max(free_cost, guess_cost), 2.0 * free_cost) + moving_cost
-    least_price = WORTH * cost / max(missed.sum(), _TINY)
-    least_price = _rounded(max(least_price, NO_PRICE))
+    safe_price = WORTH * cost / max(missed.sum(), _TINY)
+    safe_price = _rounded(max(safe_price, NO_PRICE))
     if are_kept_again:
         return ElasticLimits(
-            least_price=least_price,
-            lowest_price=least_price,
-            extra_cost=SHARE * (free_cost + moving_cost),
+            safe_price=safe_price,
+            lowest_trial_price=safe_price,
+            affordable_extra_cost=SHARE * (free_cost + moving_cost),
         )
     return ElasticLimits(
-        least_price=least_price,
-        lowest_price=max(_LOWEST * least_price, NO_PRICE),
-        extra_cost=SHARE * free_cost,
+        safe_price=safe_price,
+        lowest_trial_price=max(_LOWEST * safe_price, NO_PRICE),
+        affordable_extra_cost=SHARE * free_cost,
     )
 
 

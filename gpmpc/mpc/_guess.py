@@ -65,11 +65,11 @@ def read_request(
     if plan is not None and prediction.is_held:
         raise SettingError("plan", "is not taken by a form that linearises one point")
     _check_kappas(prediction, request)
-    if not request.finite:
-        return request
     if prediction.settings.disturbance_gain:
         disturbance = _estimate_disturbance(prediction, request, previous)
         request = request._replace(disturbance=disturbance)
+    if not request.finite:
+        return request
     if plan is not None and request.guessed_states is None:
         states = _states_of_guess(prediction, request)
         request = request._replace(guessed_states=states)
@@ -114,23 +114,17 @@ def _estimate_disturbance(
     """Returns d_k (n,); zero without a last decision.
 
     It comes from the estimate of the last decision and from the state that its input
-    led to; where its plan is of no use, or the model has no numbers there, the estimate
-    stays as it was.
+    led to. Where its plan is of no use, the state was not measured, or the model has no
+    numbers there, the estimate stays as it was.
     """
-    previous = request.previous
-    if previous is None:
-        no_estimate = np.zeros(prediction.state_dim)
-        if last_decision is None or last_decision.disturbance is None:
-            return no_estimate
-        known = np.shape(last_decision.disturbance) == no_estimate.shape
-        return np.array(last_decision.disturbance) if known else no_estimate
-    last_estimate = previous.disturbance
-    if last_estimate is None:
-        last_estimate = np.zeros_like(request.state)
+    last_estimate = _last_estimate(prediction, last_decision)
+    last_plan = request.last_plan
+    if last_plan is None or not request.finite:
+        return last_estimate
     last_input = request.references.previous_input[None]
     try:
         local = linearize(
-            prediction.model, previous.means[:1], last_input, covariance=False
+            prediction.model, last_plan.means[:1], last_input, covariance=False
         )
     except FAILURES:
         return last_estimate
@@ -139,6 +133,17 @@ def _estimate_disturbance(
         return last_estimate
     gain = prediction.settings.disturbance_gain
     return last_estimate + gain * (error - last_estimate)
+
+
+def _last_estimate(
+    prediction: PredictionModel, last_decision: Decision | None
+) -> Array:
+    """Returns the estimate of a decision (n,), zero where it has none of this size."""
+    n = prediction.state_dim
+    estimate = None if last_decision is None else last_decision.disturbance
+    if estimate is None or np.shape(estimate) != (n,):
+        return np.zeros(n)
+    return np.array(estimate)
 
 
 def initial_guess(prediction: PredictionModel, request: Request) -> Plan:
@@ -178,8 +183,8 @@ def _guess_means(prediction: PredictionModel, request: Request) -> Array:
     means[0] = request.state
     if request.guessed_states is not None:
         means[1:] = request.guessed_states[1:]
-    elif request.previous is not None:
-        means[1:] = continued_means(request.previous, request.state, prediction.angles)
+    elif request.last_plan is not None:
+        means[1:] = continued_means(request.last_plan, request.state, prediction.angles)
     else:
         targets = request.references.states
         remaining = np.linspace(1.0, 0.0, len(means))[1:, None]
@@ -217,8 +222,8 @@ def _guess_covariances(
         covariances[0] = request.covariance
     if not prediction.linearizer.depends_on_covariance:
         return covariances
-    if request.previous is not None:
-        covariances[1:] = request.previous.covariances[1:]
+    if request.last_plan is not None:
+        covariances[1:] = request.last_plan.covariances[1:]
         return covariances
     stages = prediction.point_linearizer(means[:-1], inputs, covariances[1:])
     predicted = prediction.predict_covariances(
@@ -255,7 +260,7 @@ def _leads_away(after, states, limits):
     return False
 
 
-def motion_of(prediction: PredictionModel, guess: Plan, request: Request) -> Plan:
+def open_loop_plan(prediction: PredictionModel, guess: Plan, request: Request) -> Plan:
     """Returns the plan that the inputs of a guess lead to by the model's means."""
     states = prediction.lead(request.state, guess.inputs, request.disturbance)
     return prediction.plan_of(states, guess.inputs, guess.covariances)

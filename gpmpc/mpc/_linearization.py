@@ -184,6 +184,7 @@ class LocalProblem(NamedTuple):
             request.references.previous_input,
             np.ascontiguousarray(unknowns, dtype=np.float64),
         )
+        # Where moments are matched, they are linearised at the plan's covariances next.
         return self._replace(plan=Plan(states, inputs, self.covariances))
 
     def stage_costs(self, references: References) -> Array:
@@ -246,11 +247,13 @@ class PredictionModel:
         lower, upper = problem.inputs.by_stage(horizon)
         rate_lower, rate_upper = problem.input_rates.by_stage(horizon)
         #: bounds of every stage, infinite where there are none: roll-outs read them
-        self.limits = InputBounds(lower, upper, rate_lower, rate_upper)
+        self.roll_out_bounds = InputBounds(lower, upper, rate_lower, rate_upper)
         #: the same for programs and violations; rates are (0, m) where none is bounded,
         #: so that they take no rows
         count = horizon if problem.input_rates.finite else 0
-        self.bounds = InputBounds(lower, upper, rate_lower[:count], rate_upper[:count])
+        self.program_bounds = InputBounds(
+            lower, upper, rate_lower[:count], rate_upper[:count]
+        )
         self.constraints = ConstraintRows(problem, horizon, settings.covariance)
         #: whether every last plan of a decision is rolled out: curved constraints are
         #: judged where it leads
@@ -332,8 +335,8 @@ class PredictionModel:
         """Returns the problem at a plan from its stages: covariances, rows, cost."""
         cost = self.costs.at(plan, request.parameters)
         covariances = self._covariances_of(plan, stages, cost, request)
-        if self.is_held and request.previous is not None:
-            stages = self._in_increments(plan, stages, request, request.previous)
+        if self.is_held and request.last_plan is not None:
+            stages = self._in_increments(plan, stages, request, request.last_plan)
         rows = self.constraints.at(
             plan, covariances, self.stage_count, request.parameters, request.kappas
         )
@@ -347,7 +350,7 @@ class PredictionModel:
             violation: By how much the plan misses a bound, at most.
         """
         constraints = self.constraints
-        if not violation > KEPT or not constraints.per_stage:
+        if violation <= KEPT or not constraints.per_stage:
             return Status.SOLVED
         if self.misses_hard_rows(local, KEPT):
             return Status.HARD_BOUND_MISSED
@@ -652,7 +655,8 @@ class StageCosts:
             axis=0,
         )
         weights = self._linearizer.weight(self._Q + squares[:, :n, :n])
-        # The squares weigh the mean already; the weights add what spreads cost.
+        # Z weighs the mean already, in the kernels: its xx block adds the cost of
+        # spread.
         weights[:, 0] = self._Q
         return self.quadratic._replace(
             state=weights, terminal=weights[-1], squares=squares

@@ -43,7 +43,7 @@ from gpmpc.mpc._controller import (
     Decision,
     Reference,
     Timing,
-    is_usable,
+    is_usable_belief,
     one_step_on,
     read_reference,
 )
@@ -442,7 +442,7 @@ def check_policy(on_failure: str) -> None:
 
 def _is_usable(belief: Gaussian) -> bool:
     """Tells whether a belief can be decided on."""
-    return is_usable(to_array(belief.mean), to_array(belief.covariance))
+    return is_usable_belief(to_array(belief.mean), to_array(belief.covariance))
 
 
 def _conclude(

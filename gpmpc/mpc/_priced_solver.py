@@ -56,7 +56,7 @@ class PricedSolver:
         """Lets the next program price its elastic rows, since a promise was broken.
 
         A plan has missed them by more than programs under the exact price promised.
-        What they are worth is then the least price.
+        What they are worth is then the safe price.
         """
         self._price_is_due = True
 
@@ -75,7 +75,7 @@ class PricedSolver:
         """
         solution = self._solve_at(program, warm_start, self.row_prices)
         constraints = self._prediction.constraints
-        may_give_way = constraints.any_elastic and self.row_prices is constraints.prices
+        may_give_way = constraints.any_elastic and self._prices_are_exact
         if self._price_is_due and may_give_way and solution.status.solved:
             planned = local.with_solution(program, solution.x, self._request)
             violations = planned.row_violations()
@@ -87,6 +87,11 @@ class PricedSolver:
         self._price_is_due = False
         self._is_first = False
         return solution
+
+    @property
+    def _prices_are_exact(self) -> bool:
+        """Whether no elastic row has got another price yet."""
+        return self.row_prices is self._prediction.constraints.prices
 
     def _solve_at(
         self,
@@ -129,7 +134,7 @@ class PricedSolver:
         """Returns the solution under the price that elastic rows are worth.
 
         A plan that goes on along the last one is rolled out, to see what a price costs.
-        A first plan, whose guess says little about costs, takes the least price.
+        A first plan, whose guess says little about costs, takes the safe price.
 
         Args:
             program: The program.
@@ -152,13 +157,13 @@ class PricedSolver:
             Q=self._prediction.problem.cost.Q,
             largest_weight=self._prediction.problem.largest_weight,
         )
-        if self._is_first and request.previous is not None:
+        if self._is_first and request.last_plan is not None:
             free_cost = self._cost_when_followed(program, local, free)
-            if math.isfinite(free_cost + limits.extra_cost):
+            if math.isfinite(free_cost + limits.affordable_extra_cost):
                 return self._solve_at_highest_price(
                     program, local, exact, gives_way, limits, free_cost
                 )
-        return self._solve_cheaper(program, exact, gives_way, limits.least_price)
+        return self._solve_cheaper(program, exact, gives_way, limits.safe_price)
 
     def _solve_at_highest_price(
         self,
@@ -171,15 +176,15 @@ class PricedSolver:
     ) -> QPSolution:
         """Returns the solution under the highest price whose plan is affordable.
 
-        It is the exact price, or the highest of a few between the lowest and that, and
-        the lowest where none of them is. ``free_cost`` is what the plan without the
-        elastic rows costs the model.
+        It is the exact price where that is affordable; else it is found by bisection of
+        its logarithm, and is the lowest trial price where no other will do.
+        ``free_cost`` is what the plan without the elastic rows costs the model.
         """
-        affordable_cost = free_cost + limits.extra_cost
+        affordable_cost = free_cost + limits.affordable_extra_cost
         if self._cost_when_followed(program, local, exact) <= affordable_cost:
             return exact
         unaffordable_price = float(self._prediction.constraints.prices[gives_way].max())
-        affordable_price = min(limits.lowest_price, unaffordable_price)
+        affordable_price = min(limits.lowest_trial_price, unaffordable_price)
         best = None
         for _ in range(TRIALS):
             if self._stopwatch.is_late:

@@ -193,7 +193,7 @@ def _follow(
     request: Request,
 ) -> Plan:
     """Returns the plan that the means obey under a feedback towards another one."""
-    limits = prediction.limits
+    limits = prediction.roll_out_bounds
     law = Feedback(
         states=target.states[None],
         inputs=target.inputs[None],
@@ -221,7 +221,7 @@ def _roll_out_belief(
     linearizer = prediction.linearizer
     n = prediction.state_dim
     F = _feedback_on_means(prediction, local, feedback)
-    limits = prediction.limits
+    limits = prediction.roll_out_bounds
     last_input = request.references.previous_input
     states = target.states.copy()
     inputs = target.inputs.copy()

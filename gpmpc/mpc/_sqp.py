@@ -101,8 +101,9 @@ class Iterate(NamedTuple):
 
     local: LocalProblem
     status: Status | None  # None where one more program is due
-    # whether the plan, if it is the last one, is to be rolled out before it is used
-    leaves_defects: bool = False
+    # whether the plan, if it is the last one, is rolled out before it is used: one of
+    # a loose tolerance has defects, too
+    needs_roll_out: bool = False
 
 
 class _Trial(NamedTuple):
@@ -154,28 +155,33 @@ class Progress(NamedTuple):
         return self.size * slower <= tolerance * (1.0 - slower)
 
 
+class Continuity(NamedTuple):
+    """Whether a step goes on along the last plan."""
+
+    goes_on: bool
+    squared_length: float  # of the step, in the metric of the cost
+
+
 def measure_continuity(
     prediction: PredictionModel,
     request: Request,
     local: LocalProblem,
     proposed: Plan,
-) -> tuple[bool, float]:
+) -> Continuity:
     """Tells whether a step goes on along the last plan, so that one program is enough.
 
     That is the real-time iteration. A step that leads much further than the last one,
     and is not slight beside the cost, answers a jump of the reference or of the state.
     On plants that bend much, the plans of one program a step are not consistent;
     iterating each of them is slower and, on swing-ups, no better.
-
-    Returns:
-        Whether it does, and the length of the step, squared in the metric of the cost.
     """
     cost, squared_length = _measure_step.unchecked(local, request.references, proposed)
-    last_lengths = () if request.previous is None else request.previous.steps
+    last_lengths = () if request.last_plan is None else request.last_plan.steps
     if len(last_lengths) == 0:
-        return True, squared_length
+        return Continuity(True, squared_length)
     slight = _SLIGHT_STEP * (max(cost, 0.0) + smallest_cost(prediction, request))
-    return squared_length <= max(slight, _FURTHER * last_lengths[0]), squared_length
+    longest = max(slight, _FURTHER * last_lengths[0])
+    return Continuity(squared_length <= longest, squared_length)
 
 
 def smallest_cost(prediction: PredictionModel, request: Request) -> float:
@@ -185,8 +191,8 @@ def smallest_cost(prediction: PredictionModel, request: Request) -> float:
     """
     return _cost_of_small_input.unchecked(
         R=prediction.costs.quadratic.input[0],
-        lower=prediction.limits.lower[0],
-        upper=prediction.limits.upper[0],
+        lower=prediction.roll_out_bounds.lower[0],
+        upper=prediction.roll_out_bounds.upper[0],
         previous_input=request.references.previous_input,
     )
 
@@ -466,11 +472,17 @@ def _obeys_dynamics(local: LocalProblem) -> bool:
 
 @compiled
 def _cost_of_small_input(R, lower, upper, previous_input):
-    """Returns the least cost, over the inputs, of a thousandth of the last input."""
+    """Returns the least cost, over the inputs, of a thousandth of the last input.
+
+    An input whose bounds leave it no room does not count.
+    """
     least = np.inf
     for j in range(len(R)):
         size = min(max(1.0, abs(previous_input[j])), upper[j] - lower[j]) * _SMALL
-        least = min(least, R[j, j] * size * size)
+        if size > 0.0:
+            least = min(least, R[j, j] * size * size)
+    if least == np.inf:
+        return _TINY
     return least + _TINY
 
 

@@ -52,7 +52,7 @@ from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._guess import (
     initial_guess,
     is_contradicted,
-    motion_of,
+    open_loop_plan,
     read_request,
 )
 from gpmpc.mpc._linear_quadratic import (
@@ -180,7 +180,7 @@ class GPMPC:
         if not prediction.may_iterate:
             self._most_programs = 1
         #: what novelty is measured by; see ``with_model``
-        self._scales = data_scales(model)
+        self.data_scales = data_scales(model)
 
     @property
     def most_programs(self) -> int:
@@ -224,10 +224,11 @@ class GPMPC:
                 reference inputs are missing.
             DataError: Reference, parameters or plan are not finite.
         """
+        stopwatch = Stopwatch(self.budget)
         request = read_request(
             self.prediction, belief, reference, previous, parameters, plan
         )
-        return self._decide(request, Stopwatch(self.budget))
+        return self._decide(request, stopwatch)
 
     def _decide(
         self,
@@ -246,13 +247,17 @@ class GPMPC:
             if local is None:
                 guess = initial_guess(self.prediction, request)
                 local = self.prediction.linearize(guess, request)
-            local = self._at_a_motion(local, request)
+            local = self._at_what_the_model_does(local, request)
             if not request.starts_afresh:
-                return self._improve(local, request, stopwatch, self._most_programs)
+                return self._run_programs(
+                    local, request, stopwatch, self._most_programs
+                )
             decision = self._decide_first(local, request, stopwatch)
-            if decision.status is Status.INFEASIBLE and not self.prediction.is_held:
+            is_infeasible = decision.status is Status.INFEASIBLE
+            may_be_tried_again = is_infeasible and not decision.applicable
+            if may_be_tried_again and not self.prediction.is_held:
                 # A line through an obstacle may see it from both of its sides.
-                motion = motion_of(self.prediction, local.plan, request)
+                motion = open_loop_plan(self.prediction, local.plan, request)
                 local = self.prediction.linearize(motion, request)
                 decision = self._decide_first(local, request, stopwatch, decision)
             return decision
@@ -260,24 +265,27 @@ class GPMPC:
             status = Status.NUMERICAL_TROUBLE
             if isinstance(error, FunctionNotFinite):
                 status = Status.FUNCTION_NOT_FINITE
+            stopwatch.lap("model")
             return request.failed_decision(status, timing=stopwatch.timing)
 
-    def _at_a_motion(self, local: LocalProblem, request: Request) -> LocalProblem:
+    def _at_what_the_model_does(
+        self, local: LocalProblem, request: Request
+    ) -> LocalProblem:
         """Returns the problem at the first guess, or at what its inputs lead to.
 
         The latter where the model contradicts the guess: derivatives along states that
         no motion takes, multiplied over the horizon, may grow beyond any number. States
         that were handed over are taken as they are.
         """
-        scales = self._scales
+        scales = self.data_scales
         if scales is None or request.guessed_states is not None:
             return local
         if not is_contradicted(local.plan, local.stages, scales.ranges):
             return local
-        motion = motion_of(self.prediction, local.plan, request)
+        motion = open_loop_plan(self.prediction, local.plan, request)
         return self.prediction.linearize(motion, request)
 
-    def _improve(
+    def _run_programs(
         self,
         local: LocalProblem,
         request: Request,
@@ -307,7 +315,9 @@ class GPMPC:
         if number_is_open and not self.prediction.constraints.smooth:
             decision = self._decide_whether_more_pay(local, request, stopwatch)
         else:
-            decision = self._improve(local, request, stopwatch, self._most_programs)
+            decision = self._run_programs(
+                local, request, stopwatch, self._most_programs
+            )
         if failed is None:
             return decision
         return replace(decision, iterations=decision.iterations + failed.iterations)
@@ -321,17 +331,20 @@ class GPMPC:
         it further than its horizon shows. A swing-up that is iterated at once may lean
         for ever.
         """
-        quick = self._improve(local, request, stopwatch, most_programs=1)
+        quick = self._run_programs(local, request, stopwatch, most_programs=1)
         linearizer = self.prediction.linearizer
         if linearizer.depends_on_covariance or not quick.applicable:
             return quick
         if stopwatch.is_late:
             return quick
         try:
-            thorough = self._improve(local, request, stopwatch, self._most_programs)
+            thorough = self._run_programs(
+                local, request, stopwatch, self._most_programs
+            )
             pays = thorough.applicable and self._pays(thorough, quick, local, request)
         except FAILURES:  # more programs, or a plan's inputs, led out of its numbers
             return quick
+        stopwatch.lap("model")
         return replace(
             thorough if pays else quick,
             iterations=quick.iterations + thorough.iterations,
@@ -352,7 +365,7 @@ class GPMPC:
         """
         promised = MISS_RATIO * quick.program_violation + KEPT
         if quick.violation > promised:
-            return thorough.violation < quick.violation
+            return MISS_RATIO * thorough.violation < quick.violation
         outcome = self._outcome(thorough, local, request)
         return outcome.is_much_better_than(self._outcome(quick, local, request), _PAYS)
 
@@ -376,6 +389,7 @@ class GPMPC:
         The first stages of all of them are linearised in one call. The quadratic
         programs are solved one by one; the model's time is shared out equally.
         """
+        start = perf_counter()
         all_parameters = parameters
         if all_parameters is None:
             all_parameters = [None] * len(beliefs)
@@ -385,7 +399,6 @@ class GPMPC:
                 beliefs, references, previous, all_parameters, strict=True
             )
         ]
-        start = perf_counter()
         finite = [request for request in requests if request.finite]
         try:
             guesses = [initial_guess(self.prediction, request) for request in finite]
@@ -412,10 +425,10 @@ class GPMPC:
             inputs: (H, m).
             covariances: Of the states (H + 1, n, n).
         """
-        if self._scales is None:
+        if self.data_scales is None:
             return math.nan
         return novelty_when_read(
-            self.prediction.model, means, inputs, covariances, self._scales
+            self.prediction.model, means, inputs, covariances, self.data_scales
         )
 
     def with_model(self, model: DynamicsModel) -> "GPMPC":
@@ -534,8 +547,8 @@ class _ControlStep:
         self._globalization: Globalization | None = None
         self._squared_lengths: list[float] = []  # of the programs' steps
         self._warm_start: QPSolution | None = None
-        if request.previous is not None:
-            self._warm_start = request.previous.solution
+        if request.last_plan is not None:
+            self._warm_start = request.last_plan.solution
 
     def run(self, local: LocalProblem) -> Decision:
         """Returns the decision that programs lead to from the problem at a guess.
@@ -553,7 +566,7 @@ class _ControlStep:
             self._stopwatch.lap("build")
             solution = self._solve(program, local)
             self._stopwatch.lap("solve")
-            if not _is_usable(program, solution, local.plan):
+            if not _solution_is_usable(program, solution, local.plan):
                 # The plan of the round before is the last one.
                 if local.plan is not guess:
                     local = self._close_defects(local, local, program)
@@ -562,7 +575,7 @@ class _ControlStep:
             if iterate.status is None and self._may_go_on:
                 local = iterate.local
                 continue
-            last_problem = self._end(iterate, local, program)
+            last_problem = self._rolled_out_where_needed(iterate, local, program)
             status = iterate.status
             is_rolled_out = last_problem is not iterate.local
             has_moved = iterate.local is not local  # else a program more says the same
@@ -578,7 +591,7 @@ class _ControlStep:
                 if self._most_programs > 1:
                     status = None
             if status is None:
-                status = self._limit
+                status = self._limit_reached
             return self._conclude(last_problem, guess, solution, status)
 
     @property
@@ -587,7 +600,7 @@ class _ControlStep:
         return self._programs < self._most_programs and not self._stopwatch.is_late
 
     @property
-    def _limit(self) -> Status:
+    def _limit_reached(self) -> Status:
         """The limit that keeps the iteration from one more program."""
         if self._programs < self._most_programs:
             return Status.TIME_LIMIT
@@ -597,7 +610,7 @@ class _ControlStep:
         """Returns the quadratic program in the inputs."""
         program = condense(
             cost=local.cost,
-            bounds=self._prediction.bounds,
+            bounds=self._prediction.program_bounds,
             stages=local.stages,
             start=local.plan.states[0],
             references=self._request.references,
@@ -622,8 +635,16 @@ class _ControlStep:
     ) -> Iterate:
         """Takes a program's step: whole where that is enough, else globalised."""
         planned = local.with_solution(program, solution.x, self._request)
-        if self._whole_step_is_enough(local, planned.plan):
+        if self._most_programs == 1:
             return Iterate(planned, solution.status)
+        if self._may_stop_after_one:
+            continuity = measure_continuity(
+                self._prediction, self._request, local, planned.plan
+            )
+            if continuity.goes_on:
+                # The next decision compares the length of its step with this one.
+                self._squared_lengths.append(continuity.squared_length)
+                return Iterate(planned, solution.status)
         if self._globalization is None:
             self._globalization = Globalization(
                 self._prediction,
@@ -636,33 +657,23 @@ class _ControlStep:
         self._squared_lengths.append(globalization.squared_length)
         is_solved = iterate.status is Status.SOLVED
         has_loose_tolerance = self._controller.iterations is None
-        return iterate._replace(leaves_defects=not is_solved or has_loose_tolerance)
+        return iterate._replace(needs_roll_out=not is_solved or has_loose_tolerance)
 
-    def _whole_step_is_enough(self, local: LocalProblem, proposed: Plan) -> bool:
-        """Returns whether to take a step whole, as in the real-time iteration.
+    @property
+    def _may_stop_after_one(self) -> bool:
+        """Whether the step may be taken whole, as in the real-time iteration.
 
-        A first program of several measures whether it goes on along the last plan, and
-        keeps the length of its step for the next decision to compare with. Under curved
-        rows first plans may, too: a program is judged by the plan it leads to.
+        It may be by the first program of a decision that has a last plan to compare
+        with. Under curved rows first plans may, too: a program is judged by the plan it
+        leads to.
         """
-        if self._most_programs == 1:
-            return True
-        request = self._request
         is_first_program = self._programs == 1
-        continues_plan = request.previous is not None
-        may_stop_after_one = self._controller.iterations is None and (
-            continues_plan or self._prediction.constraints.smooth
-        )
-        if not (is_first_program and may_stop_after_one):
-            return False
-        continues, squared_length = measure_continuity(
-            self._prediction, request, local, proposed
-        )
-        if continues:
-            self._squared_lengths.append(squared_length)
-        return continues
+        number_is_open = self._controller.iterations is None
+        has_last_plan = self._request.last_plan is not None
+        is_curved = self._prediction.constraints.smooth
+        return is_first_program and number_is_open and (has_last_plan or is_curved)
 
-    def _end(
+    def _rolled_out_where_needed(
         self, iterate: Iterate, local: LocalProblem, program: CondensedProgram
     ) -> LocalProblem:
         """Returns the problem of the plan that a step led to, rolled out where needed.
@@ -672,7 +683,7 @@ class _ControlStep:
             local: The problem that the step started from.
             program: Of that problem.
         """
-        if iterate.leaves_defects or self._prediction.rolls_out:
+        if iterate.needs_roll_out or self._prediction.rolls_out:
             return self._close_defects(iterate.local, local, program)
         return iterate.local
 
@@ -710,7 +721,7 @@ class _ControlStep:
     def _violation(self, local: LocalProblem) -> float:
         """Returns by how much a plan misses a bound, at most."""
         last_input = self._request.references.previous_input
-        return local.violation(self._prediction.bounds, last_input)
+        return local.violation(self._prediction.program_bounds, last_input)
 
     def _conclude(
         self,
@@ -773,7 +784,7 @@ class _ControlStep:
 
         Where its stages hold no variances, it is to be measured when it is read.
         """
-        scales = self._controller._scales
+        scales = self._controller.data_scales
         linearizer = self._prediction.linearizer
         if scales is not None and linearizer.covariance == "zero_order":
             V = local.stages.V
@@ -791,7 +802,9 @@ def _check_iterations(iterations: int | None, prediction: PredictionSettings) ->
         raise SettingError("iterations", f"{rule}; got {iterations}")
 
 
-def _is_usable(program: CondensedProgram, solution: QPSolution, plan: Plan) -> bool:
+def _solution_is_usable(
+    program: CondensedProgram, solution: QPSolution, plan: Plan
+) -> bool:
     """Returns whether a solution leads to a plan that is no worse.
 
     It does where it was solved, or where the solver stopped at a limit at a feasible

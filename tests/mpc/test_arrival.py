@@ -417,3 +417,33 @@ def test_a_step_that_cannot_be_taken_asks_no_further_program(monkeypatch):
     )
     assert decision.iterations == 2
     assert decision.status is Status.SOFT_BOUND_MISSED
+
+
+def test_a_locked_input_takes_no_programs_at_rest():
+    """Offsets are relative to the cost of an input that can move."""
+
+    def next_state(x, u):
+        angle, rate = x.unbind(-1)
+        push = torch.tanh(u.sum(-1))
+        next_rate = rate + 0.1 * (9.8 * torch.sin(angle) + push - 0.3 * rate)
+        return torch.stack([angle + 0.1 * next_rate, next_rate], -1)
+
+    problem = Problem(
+        Tracking([1.0, 1.0], [0.1, 0.1]), inputs=Box([-1.0, 0.0], [1.0, 0.0])
+    )
+    controller = GPMPC(
+        KnownModel(next_state, 2, 2),
+        Linearization(),
+        problem,
+        horizon=10,
+        initial_input=[0.0, 0.0],
+        prediction=MEANS,
+        iterations=10,
+    )
+    upright = np.array([np.pi, 0.0])
+    decision = None
+    for k in range(4):
+        almost = Gaussian.certain(upright + [1e-12 * (-1) ** k, 1e-13])
+        decision = controller.control(almost, Reference(upright), decision)
+        assert decision.status is Status.SOLVED
+        assert decision.iterations <= 2

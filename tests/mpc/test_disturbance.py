@@ -241,3 +241,14 @@ def test_an_estimate_outlives_a_plan_that_cannot_be_gone_on_from():
     )
     again = mpc.control(at, AT_REST, lost)
     np.testing.assert_allclose(again.disturbance, [0.0, 0.08], atol=1e-12)
+
+
+def test_an_estimate_outlives_a_missing_measurement_without_a_loop():
+    mpc = controller(disturbance_gain=0.5)
+    states, decisions = flown(mpc, steps=5)
+    unmeasured = Gaussian.certain(np.full(2, np.nan))
+    blind = mpc.control(unmeasured, AT_REST, decisions[-1])
+    assert blind.status is Status.INVALID_MEASUREMENT
+    assert np.array_equal(blind.disturbance, decisions[-1].disturbance)
+    again = mpc.control(Gaussian.certain(states[-1]), AT_REST, blind)
+    assert np.array_equal(again.disturbance, decisions[-1].disturbance)

@@ -134,7 +134,7 @@ class StateFormMPC:
         plan = Plan(states, inputs, prediction.covariances)
         planned = prediction._replace(plan=plan)
         violation = planned.violation(
-            self.prediction.bounds, request.references.previous_input
+            self.prediction.program_bounds, request.references.previous_input
         )
         if status is Status.SOLVED:
             status = self.prediction.end_of_solved(planned, violation)
