@@ -179,7 +179,7 @@ def _choose_penalties(model: LogModel, log: Log, steps: int) -> Array:
     """Chooses the penalty of each output (o,) by rollouts: of all, then by group."""
     o = len(model.history)
     try:
-        trials = [_Trial.of(model, *halves, steps) for halves in _halves(log)]
+        trials = [_Trial.of(model, *pair, steps) for pair in _halves(log, model.past)]
     except DataError:  # too short to be divided
         return np.full(o, _FIRST_PENALTY)
     penalties = _best(trials, [np.full(o, penalty) for penalty in PENALTIES])
@@ -213,7 +213,12 @@ class _Trial:
 
     @classmethod
     def of(cls, model: LogModel, log: Log, held_out: Log, steps: int) -> "_Trial":
-        """Prepares the trial; raises ``DataError`` where a half is too short."""
+        """Prepares the trial; raises ``DataError`` where a half is too short.
+
+        Pieces that are too short for so many steps are rolled out to their ends: a
+        penalty is chosen in the folds of a short log as in all of it.
+        """
+        steps = max(min(steps, held_out.longest_piece - model.past - 1), 1)
         windows = held_out.windows(steps, past=model.past, most=_WINDOWS)
         judged = tuple(sorted({min(step, steps) for step in _JUDGED}))
         return cls(model, _moments(model, log), windows, judged)
@@ -302,19 +307,30 @@ def regression_data(model: LogModel, windows: Windows) -> tuple[Array, Array]:
     return model.memory.regressors(features, remembered), residuals
 
 
-def _halves(log: Log) -> list[tuple[Log, Log]]:
+def _halves(log: Log, past: int) -> list[tuple[Log, Log]]:
     """Splits a log in two halves, each of which is left out once.
 
-    By run where there are enough runs, else by blocks of time that alternate.
+    By run where there are enough runs, else by blocks of time that alternate. What a
+    rollout of a block begins with, the past, may be rows of the block before.
+
+    Returns:
+        The one half, to fit to, and the other one, to roll out.
     """
-    runs: Sequence[LogRun] = sorted(log.runs, key=len)
+    runs = sorted(log.runs, key=len)
+    with_past = runs
     if len(runs) < _FEW_RUNS:
-        runs = [block for run in log.runs for block in _blocks(run)]
-    halves = [replace(log, runs=tuple(runs[i::2])) for i in range(2)]
-    return [(halves[0], halves[1]), (halves[1], halves[0])]
+        runs = [block for run in log.runs for block in _blocks(run, past=0)]
+        with_past = [block for run in log.runs for block in _blocks(run, past)]
+    return [
+        (
+            replace(log, runs=tuple(runs[fitted::2])),
+            replace(log, runs=tuple(with_past[1 - fitted :: 2])),
+        )
+        for fitted in range(2)
+    ]
 
 
-def _blocks(run: LogRun) -> list[LogRun]:
-    """Cuts a run into blocks of time of equal lengths."""
+def _blocks(run: LogRun, past: int) -> list[LogRun]:
+    """Cuts a run into blocks of time of equal lengths, with the rows before them."""
     ends = np.linspace(0, len(run), _BLOCKS + 1).astype(int).tolist()
-    return [run.part(a, b, f"block {a}") for a, b in pairwise(ends)]
+    return [run.part(max(a - past, 0), b, f"block {a}") for a, b in pairwise(ends)]

@@ -50,6 +50,8 @@ _COST = 0.04  # of regret, that such a share may add
 _STRETCHES = 8  # of all runs, about
 _WINDOWS_OF_STRETCH = 2  # one after the other, that a stretch has rows for at least
 _EXACT = 1e-4  # of what costs nothing: an error that is smaller counts as exact
+_WORST = 4.0  # times what costs nothing: an error that is larger counts as this one
+_RESTING = 0.05  # of the stretches' median: least error that others are compared with
 
 
 @dataclass(frozen=True)
@@ -265,16 +267,19 @@ class _Regret:
     def __init__(self, errors: Array, stretches: np.ndarray):
         self._stretches = stretches
         free = errors[[_RIDGE, _STILL]]
-        self._least = self._mean_lengths(free).min(axis=0)
+        least = self._mean_lengths(free).min(axis=0)
+        # Where nothing moves a constant state is exact, and everything else infinitely
+        # far behind it.
+        self._least = np.maximum(least, _RESTING * np.median(least))
 
     def by_stretch(self, errors: Array) -> Array:
         """Computes the regrets (..., stretches) of errors (..., W, e).
 
         They are logarithms of mean errors over those of what costs nothing; positive
-        ones count twice.
+        ones count twice, and no stretch counts more than one that is four times behind.
         """
         ratios = (self._mean_lengths(errors) + _NOTHING) / (self._least + _NOTHING)
-        logarithms = np.log(np.maximum(ratios, _EXACT))
+        logarithms = np.log(np.clip(ratios, _EXACT, _WORST))
         return logarithms + np.maximum(logarithms, 0.0)
 
     def means(self, errors: Array) -> Array:

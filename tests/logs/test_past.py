@@ -15,7 +15,12 @@ from gpmpc.logs import (
     save_learned,
 )
 from gpmpc.logs._fit_form import fit_from
-from gpmpc.logs._linear_terms import fit_linear_term, refine_linear_term
+from gpmpc.logs._linear_terms import (
+    _choose_penalties,
+    _halves,
+    fit_linear_term,
+    refine_linear_term,
+)
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._stability import grows_outside
 from gpmpc.models import LogModel
@@ -115,6 +120,19 @@ def test_noisy_rows_are_fitted_better_on_rollouts_than_one_step_ahead():
     windows = tanks(1, noise=0.0).windows(40, past=model.past)
     errors = [np.abs(one.rollout_errors(windows)).mean() for one in (model, refined)]
     assert errors[1] < 0.9 * errors[0]
+
+
+def test_penalties_are_chosen_in_folds_of_short_logs_as_in_all_of_them():
+    # Blocks of such a fold are shorter than a rollout of 50 steps with its past.
+    log = tanks(0, rows=280, noise=0.0)
+    model = with_memory(log, Memory(rows=5))
+    # Without noise the least penalty is best.
+    assert _choose_penalties(model, log, steps=50)[0] < 1e-3
+    # Each half is fitted to its own rows, which the other one only begins with.
+    first, second = _halves(log, past=5)
+    fitted = [{t for run in half[0] for t in run.time} for half in (first, second)]
+    assert fitted[0].isdisjoint(fitted[1])
+    assert first[1].windows(34, past=5).times.min() == second[0].runs[0].time[0]
 
 
 def test_a_memory_is_what_a_rollout_over_measured_rows_leaves():

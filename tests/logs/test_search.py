@@ -391,6 +391,24 @@ def test_what_runs_have_each_for_themselves_is_not_corrected():
     assert (common.ratios < 0.1).all()
 
 
+def test_a_run_at_rest_does_not_decide_for_those_that_move():
+    rng = np.random.default_rng(2)
+    states = [np.zeros((100, 2)), *rng.normal(size=(5, 100, 2))]
+    log = log_of(states, rng.normal(size=(6, 100, 1)))
+    windows = log.windows(10, past=20)
+    still = Rollouts.of_constant_state(windows)
+    errors = rng.normal(size=(len(windows), 10, 2))
+    averages = choose_averages(
+        kinematics=Increments(log.space),
+        rollouts=Rollouts(windows, windows.states[:, 21:] + 0.1 * errors),
+        judged_steps=(1, 10),
+        constant_states=dict.fromkeys((1, 10), still),
+    )
+    # Beside a constant state, which is exact at rest, everything else is infinitely
+    # far behind there; for the others that state errs fourteen times as much.
+    assert (averages.ratios < 2.0).all()
+
+
 def test_intervals_of_a_comparison_hold():
     hits = 0
     for seed in range(40):
