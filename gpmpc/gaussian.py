@@ -29,6 +29,33 @@ def check_tensors(**values: Any) -> None:
             )
 
 
+def check_covariance(key: str, value: Tensor) -> None:
+    """Raises ``SettingError`` unless a tensor (p, p) is a covariance.
+
+    It is finite, symmetric and positive semidefinite, up to round-off of its
+    deviations; these may be zero.
+    """
+    if not value.is_floating_point() or not bool(torch.isfinite(value).all()):
+        raise SettingError(key, f"must hold finite real numbers; got {value.tolist()}")
+    variances = value.diagonal()
+    if bool((variances < 0).any()):
+        raise SettingError(
+            key, f"must have variances of zero or more; got {variances.tolist()}"
+        )
+    inverse = torch.where(variances > 0, variances.rsqrt(), 1.0)
+    correlations = inverse[:, None] * value * inverse
+    round_off = 16 * len(value) * torch.finfo(value.dtype).eps
+    if bool(((correlations - correlations.mT).abs() > round_off).any()):
+        raise SettingError(key, f"must be symmetric; got {value.tolist()}")
+    smallest = float(torch.linalg.eigvalsh(correlations)[0])
+    if smallest < -round_off:
+        raise SettingError(
+            key,
+            "must be positive semidefinite; got correlations with the eigenvalue "
+            f"{smallest:.3g}",
+        )
+
+
 def constant_arrays(*tensors: Tensor) -> list[NDArray[Any]] | None:
     """Returns tensors as arrays, in microseconds: control steps call it repeatedly.
 

@@ -119,7 +119,7 @@ def _build(config: DictConfig) -> Experiment:
     train = instantiate(config.model, _convert_="all")
     model = _saved_model(train, system)
     training: Any = train if model is None else None
-    if config.nominal and getattr(train, "predicts", None) != "difference":
+    if config.nominal and getattr(train, "predicts", "") not in ("difference", None):
         raise SettingError(
             "nominal", "needs model=difference_gp, which learns what it misses"
         )

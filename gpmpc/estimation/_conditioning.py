@@ -28,6 +28,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from gpmpc.gaussian import nearest_positive_semidefinite
+
 _ROUND_OFF = 16.0  # of a sum of products, in units of the last place of its largest
 # deviation of a sensor's noise over what it shows: below, it is nearly perfect
 _PERFECT = 1e-6
@@ -95,16 +97,22 @@ def whitened_cross_covariance(root: Tensor, cross_covariance: Tensor) -> Tensor:
 def unexplained_covariance(covariance: Tensor, H_root: Tensor) -> Tensor:
     """Computes the part of Cov[y] (*batch, p, p) that Y = H L does not explain.
 
-    That is the error of linearisation.
+    That is the error of linearisation, a covariance. Sigma points of which one has a
+    negative weight may find less of Cov[y] than Y explains: what lies below zero is
+    left out, since it would take from the sensors' noise, which is known.
 
     Entries that are round-off of Cov[y] are zero.
     """
     remainder = covariance - H_root @ H_root.mT
     remainder = (remainder + remainder.mT) / 2
-    sizes = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
-    eps = torch.finfo(covariance.dtype).eps
-    round_off = _ROUND_OFF * eps * sizes[..., :, None] * sizes[..., None, :]
-    return torch.where(remainder.abs() <= round_off, 0.0, remainder)
+    deviations = covariance.diagonal(dim1=-2, dim2=-1).clamp_min(0).sqrt()
+    sizes = deviations[..., :, None] * deviations[..., None, :]
+    round_off = _ROUND_OFF * torch.finfo(covariance.dtype).eps
+    remainder = torch.where(remainder.abs() <= round_off * sizes, 0.0, remainder)
+    correlations = torch.where(sizes > 0, remainder / sizes, 0.0)
+    projected, deficit = nearest_positive_semidefinite(correlations)
+    indefinite = deficit > round_off * len(deviations)
+    return torch.where(indefinite[..., None, None], sizes * projected, remainder)
 
 
 def condition(root: Tensor, H_root: Tensor, noise: Tensor) -> Conditioned:

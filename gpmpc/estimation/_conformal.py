@@ -447,7 +447,8 @@ def _observe(state, rows, bounds, step, adaptation, scores, stages):
         for r in range(len(rows)):
             value = 0.0
             for i in range(len(state)):
-                value += rows[r, i] * state[i]
+                if rows[r, i] != 0.0:  # a state that was not measured is NaN
+                    value += rows[r, i] * state[i]
             bound = bounds[plan, k, r]
             counts = bound == bound
             any_bound_counts = any_bound_counts or counts

@@ -228,19 +228,21 @@ def _standardized_inputs(inputs: Array) -> Array:
     Raises:
         DataError: An input does not move, or two move alike.
     """
-    sizes = np.abs(inputs).max(axis=0)
     centred = inputs - inputs.mean(axis=0)
     squares = np.square(centred).sum(axis=0)
-    for j in range(inputs.shape[1]):
-        round_off = len(inputs) * np.square(1e-14 * sizes[j])
-        if squares[j] <= round_off:
-            raise DataError(
-                f"input {j + 1} is constant: the data cannot tell its delay; "
-                "let it move, or leave the column out"
-            )
+    for j in np.flatnonzero(squares <= _round_off_of_squares(inputs)):
+        raise DataError(
+            f"input {j + 1} is constant: the data cannot tell its delay; "
+            "let it move, or leave the column out"
+        )
     standardized = centred / np.sqrt(squares)
     _check_different(standardized)
     return standardized
+
+
+def _round_off_of_squares(inputs: Array) -> Array:
+    """Returns what the squares of centred inputs (T, m) sum to by round-off (m,)."""
+    return len(inputs) * np.square(1e-14 * np.abs(inputs).max(axis=0))
 
 
 def _check_different(inputs: Array) -> None:
@@ -280,9 +282,15 @@ def _independent_inputs(state_basis: Array, acting: Array, delay: float) -> Arra
         delay: Their delay [steps], for the message.
 
     Raises:
-        DataError: That part is nothing.
+        DataError: That part is nothing, or the inputs do not move.
     """
     sizes = np.square(acting - acting.mean(axis=0)).sum(axis=0)
+    for j in np.flatnonzero(sizes <= _round_off_of_squares(acting)):
+        raise DataError(
+            f"input {j + 1} of {delay:g} steps before is constant in the rows that all "
+            "delays can be compared over, though it moves elsewhere: the data cannot "
+            "tell the delay; let it move for longer, or lower `longest`"
+        )
     remainder = _without(state_basis, acting)
     remaining = np.square(remainder).sum(axis=0)
     for j in np.flatnonzero(remaining <= _DEPENDENT * sizes):

@@ -53,7 +53,7 @@ from gpmpc.exceptions import (
     check_number,
     check_numbers,
 )
-from gpmpc.gaussian import Gaussian, check_tensors
+from gpmpc.gaussian import Gaussian, check_covariance, check_tensors
 from gpmpc.models._nominal import linearize_function
 from gpmpc.propagation import Linearization, Propagator, Unscented
 from gpmpc.propagation._propagator import checked_arguments
@@ -67,7 +67,7 @@ class Measurement(TensorModel):
 
     Raises:
         ShapeError: R is not square.
-        SettingError: R is no tensor, or an angle is no entry of y.
+        SettingError: R is no tensor or no covariance, or an angle is no entry of y.
 
     >>> seen = Measurement.of_states(4, states=[0, 2], std=[0.01, 0.02])
     >>> seen.output_dim, seen.noise_covariance.diagonal().sqrt().tolist()
@@ -93,6 +93,7 @@ class Measurement(TensorModel):
         R = self.noise_covariance
         if R.dim() != 2 or len(R) != R.shape[1]:
             raise ShapeError(f"noise_covariance must be (p, p); got {tuple(R.shape)}")
+        check_covariance("noise_covariance", R)
         if not callable(self.function):
             raise SettingError(
                 "function", f"must be a function of the state; got {self.function!r}"
@@ -314,21 +315,21 @@ class KalmanFilter:
         belief = belief.in_order(self._names.state_names)
         y = self._as_measurement(belief, measured)
         R = self.measurement.noise_covariance
-        view = self._view(belief)
+        expected = self._predicted_measurement(belief)
         missing = ~(y.abs() < UNMEASURED)
-        innovation = state_difference(y, view.mean, self.measurement.angles)
+        innovation = state_difference(y, expected.mean, self.measurement.angles)
         # A missing entry shows nothing, with a noise that is independent of others.
         unrelated = missing[..., None] | missing[..., None, :]
         eye = torch.eye(len(R)).to(R)
-        noise = torch.where(unrelated, eye, view.unexplained + R)
-        H_root = torch.where(missing[..., None], 0.0, view.H_root)
-        posterior = condition(view.root, H_root, noise)
+        noise = torch.where(unrelated, eye, expected.unexplained + R)
+        H_root = torch.where(missing[..., None], 0.0, expected.H_root)
+        posterior = condition(expected.root, H_root, noise)
         correction = posterior.gain @ torch.where(missing, 0.0, innovation)[..., None]
         corrected = Gaussian(belief.mean + correction[..., 0], posterior.covariance)
         return Update(
             belief=corrected,
             innovation=torch.where(missing, torch.nan, innovation),
-            covariance=view.covariance + R,
+            covariance=expected.covariance + R,
         )
 
     def _as_input(self, belief: Gaussian, input: Any) -> Tensor:
@@ -349,28 +350,26 @@ class KalmanFilter:
             )
         return y
 
-    def _view(self, belief: Gaussian) -> "_View":
+    def _predicted_measurement(self, belief: Gaussian) -> "_PredictedMeasurement":
         """Computes what sensors show of a belief (*batch, n), without their noise."""
         root = covariance_root(belief.covariance)
         if getattr(self.observer, "first_order", False):
             no_input = checked_arguments(self.measurement, belief, None)
             value, H, _ = predict_with_jacobian(self.measurement, belief.mean, no_input)
             H_root = H @ root
-            return _View(
+            return _PredictedMeasurement(
                 root=root,
                 H_root=H_root,
                 mean=value.mean,
-                covariance=squared(H_root) + value.covariance,
                 unexplained=value.covariance,
             )
         propagated = self.observer.propagate(self.measurement, belief)
         covariance = propagated.belief.covariance
         H_root = whitened_cross_covariance(root, propagated.cross_covariance)
-        return _View(
+        return _PredictedMeasurement(
             root=root,
             H_root=H_root,
             mean=propagated.belief.mean,
-            covariance=covariance,
             unexplained=unexplained_covariance(covariance, H_root),
         )
 
@@ -414,15 +413,19 @@ class KalmanFilter:
         )
 
 
-class _View(NamedTuple):
+class _PredictedMeasurement(NamedTuple):
     """A belief N(mu, L L') as sensors show it."""
 
     root: Tensor  # L (*batch, n, n)
     H_root: Tensor  # Y = H L of Cov[x, y] = L Y' (*batch, p, n)
     mean: Tensor  # E[y] (*batch, p)
-    covariance: Tensor  # Cov[y] (*batch, p, p)
     # Cov[y] - Y Y', which H L does not explain (*batch, p, p); none at first order
     unexplained: Tensor
+
+    @property
+    def covariance(self) -> Tensor:
+        """Cov[y] (*batch, p, p)."""
+        return squared(self.H_root) + self.unexplained
 
 
 @explains_arguments

@@ -46,6 +46,7 @@ from gpmpc._angles import angles_of, state_difference
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, tensors_for, to_array
 from gpmpc.exceptions import DataError, ShapeError, UnsupportedModel, check_number
+from gpmpc.gaussian import check_tensors
 from gpmpc.gp import (
     GPPosterior,
     Hyperparameters,
@@ -85,9 +86,9 @@ class ProcessNoise:
         ``estimate_process_noise``, which returns it.
     """
 
-    variance: Tensor  #: sigma^2 of a step (k,)
+    variance: Tensor  #: sigma^2 of a step (k,); zero where nothing was in error
     #: rho, of the noise of a step with the next's (k,); NaN where rows are in no order
-    #: of time
+    #: of time, or nothing was in error
     correlation: Tensor
 
     @property
@@ -168,16 +169,19 @@ def with_process_noise(
 
     Args:
         posterior: The GPs.
-        noise: The noise, or its variances (k,).
+        noise: The noise, or its variances (k,). Where an estimated one is zero an
+            output keeps what it has: its rows show no noise.
 
     Raises:
         UnsupportedModel: The posterior holds a sparse model's pseudo-observations.
         ShapeError: The number of outputs is another one.
+        SettingError: The variances are no tensor, or one is not positive.
 
     See Also:
         ``estimate_process_noise``, which finds it.
     """
     variance = noise.variance if isinstance(noise, ProcessNoise) else noise
+    check_tensors(noise=variance)
     if not isinstance(posterior, GPPosterior) or not posterior.has_observation_noise:
         raise UnsupportedModel(
             "the noise of a GPPosterior of observed rows can be replaced; train a "
@@ -187,12 +191,15 @@ def with_process_noise(
         raise ShapeError(
             f"variances must be ({posterior.output_dim},); got {tuple(variance.shape)}"
         )
+    variance = variance.to(posterior.weights)
+    if isinstance(noise, ProcessNoise):
+        variance = torch.where(variance > 0, variance, posterior.noise_variance)
     return GPPosterior.from_hyperparameters(
         posterior.features,
         posterior.targets,
         lengthscales=posterior.lengthscales,
         signal_variance=posterior.signal_variance,
-        noise_variance=variance.to(posterior.weights),
+        noise_variance=variance,
         input_dim=posterior.input_dim,
         predicts=posterior.predicts,
         offset=posterior.offset,

@@ -102,6 +102,9 @@ class ModelWriter:
 
     def _write_gps(self, gp: GPPosterior) -> str:
         """Writes the tables of GPs over the same points; returns their name."""
+        if not isinstance(gp, GPPosterior):
+            rule = "an exported residual is a GPPosterior"
+            raise SettingError("model", f"{rule}; got {type(gp).__name__}")
         if str(gp.dtype) != "torch.float64":
             raise SettingError("model", f"must be in float64; got {gp.dtype}")
         prefix = f"gp{self._gps}"

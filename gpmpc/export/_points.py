@@ -59,11 +59,11 @@ def posterior_of(model: Any) -> GPPosterior:
     """
     if isinstance(model, GPPosterior):
         return model
-    if isinstance(model, ResidualModel):
+    if isinstance(model, ResidualModel) and isinstance(model.residual, GPPosterior):
         return model.residual
     if isinstance(model, LinearWrapper):
         return posterior_of(model.model)
-    rule = "must be one of GPs to have points, a GPPosterior or a ResidualModel"
+    rule = "must be one of GPs to have points, a GPPosterior or a ResidualModel of one"
     raise SettingError("model", f"{rule}; got {type(model).__name__}")
 
 

@@ -36,9 +36,9 @@ Its parameters stand elsewhere too: rows theta = (log l, log sf, log(sf / sn)) i
 the kernel's name in files, ``gp._storage`` ("SE-ARD", where they are written and read);
 and what ``from_gpytorch`` takes for it, ``gp._gpytorch._check_se_ard``. ``1 / l^2`` and
 log sf2 travel packed (``_kernels.GPArrays``), from which ``learning._changed_model``
-makes a posterior and ``export._models`` tables. Another kernel is refused by name where
-closed forms need this one: in ``propagation._moment_matching._has_exact_moments`` and
-``_linearization._is_gp_alone``, which look at a model's form alone today.
+makes a posterior and ``export._models`` tables. Another kernel would have to be
+refused where closed forms need this one: ``_has_exact_moments`` and ``_is_gp_alone`` of
+``propagation`` look at a model's form alone, and ask for no kernel.
 """
 
 from typing import Any, NamedTuple

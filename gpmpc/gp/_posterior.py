@@ -125,7 +125,7 @@ class GPPosterior(TensorModel):
             DataError: An entry is not finite.
         """
         check_tensors(targets=targets)
-        offset = torch.zeros_like(targets[:1].flatten()) if offset is None else offset
+        offset = targets.new_zeros(targets.shape[-1:]) if offset is None else offset
         check_gp_tensors(
             features,
             targets,

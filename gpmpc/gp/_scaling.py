@@ -98,6 +98,8 @@ def standardize(
     """
     constant = _constant(columns, names, resolution)
     deviation = columns.std(dim=0, correction=0)
+    # Squares of what moves by less than 1e-154 are zero.
+    constant = constant | (deviation == 0.0)
     return Scaling(
         offset=columns.mean(dim=0), factor=torch.where(constant, 1.0, deviation)
     )

@@ -80,7 +80,7 @@ class SparseTrainer:
     #: ``"fitc"`` (Snelson and Ghahramani, 2006) has a noise of its own at every point
     #: and may underestimate it (Bauer, van der Wilk and Rasmussen, 2016)
     method: Method = "sgpr"
-    predicts: Predicts = "next_state"  #: what the GPs learn, as in ``Trainer``
+    predicts: Predicts | None = None  #: what the GPs learn, as in ``Trainer``
     #: how features and targets are scaled for training, as in ``Trainer``
     scaling: Callable[[Tensor, Sequence[str]], Scaling] = centre
     iterations: int = 100  #: of L-BFGS, at most
@@ -112,13 +112,15 @@ class SparseTrainer:
                 which is named; or the inducing points learned nothing but noise of it
                 where the subset's training learned more.
         """
-        targets = checked_targets(transitions, self.predicts)
+        predicts = self.predicts or "next_state"
+        targets = checked_targets(transitions, predicts)
         training = self.fit(
             transitions.features,
             targets,
             transitions.input_dim,
+            predicts=predicts,
             seed=seed,
-            columns=Columns.of_transitions(transitions, self.predicts),
+            columns=Columns.of_transitions(transitions, predicts),
         )
         return training.with_signals(transitions.signals)
 
@@ -141,7 +143,7 @@ class SparseTrainer:
             features,
             targets,
             input_dim,
-            predicts=predicts or self.predicts,
+            predicts=predicts or self.predicts or "next_state",
             columns=columns,
             settings=self,
         )

@@ -100,12 +100,14 @@ def check_columns(name: str, d: int, k: int, input_dim: int, predicts: str) -> N
         d: Number of columns.
         k: Number of GPs.
         input_dim: Number of controls, m.
-        predicts: What the GPs predict: d = k + m unless values.
+        predicts: What the GPs predict: d = k + m unless values, which may depend on
+            controls alone.
     """
     check_choice("predicts", predicts, PREDICTS)
     check_number("input_dim", input_dim, least=0, whole=True)
-    if input_dim >= d or (predicts != "value" and d != k + input_dim):
-        raise ShapeError(
-            f"{name} must have n + m columns, one state an output and {input_dim} "
-            f"controls; got {d} columns and {k} outputs"
-        )
+    got = f"{input_dim} controls; got {d} columns and {k} outputs"
+    if predicts != "value" and d != k + input_dim:
+        rule = "must have n + m columns, one state an output and"
+        raise ShapeError(f"{name} {rule} {got}")
+    if not max(input_dim, 1) <= d:
+        raise ShapeError(f"{name} must have n + m columns, one at least, and {got}")

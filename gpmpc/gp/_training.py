@@ -114,8 +114,9 @@ class Trainer:
     """
 
     #: what the GPs learn: the next state, the difference to it, or any values, which
-    #: ``fit`` takes
-    predicts: Predicts = "next_state"
+    #: ``fit`` takes. None: what a system's description leaves open, in
+    #: ``gpmpc.models.train`` and an ``Experiment``; elsewhere the next state
+    predicts: Predicts | None = None
     #: how features and targets are scaled for training; what comes out is in the units
     #: of the data all the same. The prior mean is what it maps to zero: the targets'
     #: mean by default and with ``standardize``, zero with ``identity``
@@ -151,7 +152,8 @@ class Trainer:
     resolution: float = RESOLUTION
 
     def __post_init__(self) -> None:
-        check_choice("predicts", self.predicts, PREDICTS)
+        if self.predicts is not None:
+            check_choice("predicts", self.predicts, PREDICTS)
         check_number("restarts", self.restarts, least=0, whole=True)
         if self.subset is not None:
             check_number("subset", self.subset, least=1, whole=True)
@@ -167,14 +169,16 @@ class Trainer:
         self, transitions: Transitions, seed: int = 0, start: GPPosterior | None = None
     ) -> Training:
         """Trains on transitions; see ``fit``."""
-        targets = checked_targets(transitions, self.predicts)
+        predicts = self.predicts or "next_state"
+        targets = checked_targets(transitions, predicts)
         training = self.fit(
             transitions.features,
             targets,
             transitions.input_dim,
+            predicts=predicts,
             seed=seed,
             start=start,
-            columns=Columns.of_transitions(transitions, self.predicts),
+            columns=Columns.of_transitions(transitions, predicts),
         )
         return training.with_signals(transitions.signals)
 
@@ -264,7 +268,7 @@ class Trainer:
             features,
             targets,
             input_dim,
-            predicts=predicts or self.predicts,
+            predicts=predicts or self.predicts or "next_state",
             columns=columns,
             settings=self,
         )

@@ -124,14 +124,16 @@ def _predict_residual_model(model: Any, x: casadi.MX, u: casadi.MX) -> _Predicti
     is_affine = all(hasattr(nominal, part) for part in "ABc")
     nominal_function: Any = getattr(nominal, "function", None)
     effect_function: Any = getattr(B, "function", None)
+    residual_known = isinstance(getattr(model, "residual", None), GPPosterior)
     nominal_known = is_affine or nominal_function is not None
     effect_known = isinstance(B, torch.Tensor) or effect_function is not None
-    if not nominal_known or not effect_known:
+    if not (residual_known and nominal_known and effect_known):
         got = type(model).__name__
         if nominal is not None:
             got += f" of a nominal {type(nominal).__name__}"
+            got += f" and a {type(model.residual).__name__}"
         raise UnsupportedModel(
-            "CasADi can take a GPPosterior, or a ResidualModel of Affine, "
+            "CasADi can take a GPPosterior, or a ResidualModel of one, Affine, "
             f"CasadiFunction and numbers; got {got}"
         )
     features: list[Any] = []

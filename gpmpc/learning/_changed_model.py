@@ -126,6 +126,20 @@ class ChangedModel(Wrapper):
         return to_array(self.gp.noise_variance if noise is None else noise)
 
     @cached_property
+    def further_noise(self) -> Array:
+        """Variances (n,) of what scatters measured states besides the GP's noise.
+
+        So do those of positions that follow from a rate, which have no GP of their own.
+        """
+        noise: Tensor | None = getattr(self.model, "observation_noise", None)
+        if self.gp is not self.model and noise is None:
+            noise = cast(Any, self.model).noise
+        if self.gp is self.model or noise is None:
+            return np.zeros(self.model.state_dim)
+        variances = np.diagonal(to_array(noise))
+        return (variances - self.B_array**2 @ self.gp_noise).clip(0.0)
+
+    @cached_property
     def signal(self) -> Array:
         """Prior variances of d (k,)."""
         return self.learning.share**2 * to_array(self.gp.signal_variance)

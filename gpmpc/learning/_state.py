@@ -119,7 +119,11 @@ class LearningState:
         )
 
     def without_change(self) -> "LearningState":
-        """Returns the state after a decision with the change has failed."""
+        """Returns the state after a decision with the change has failed.
+
+        It is not used for this decision. The leads stay: they speak of predictions, and
+        the next decision, elsewhere, may succeed with it.
+        """
         doubt = self.doubt
         if doubt is not None:
             doubt = doubt._replace(tries_new_plant=False)
@@ -157,7 +161,7 @@ class LearningState:
         A = local.A[0]
         B = self.model.B_array
         latent = cast(Array, local.covariance)[0]
-        noise = (B * step.noise_variance) @ B.T
+        noise = (B * step.noise_variance) @ B.T + np.diag(self.model.further_noise)
         return Expectation(
             mean=local.mean[0],
             covariance=A @ start.covariance @ A.T + latent + noise,

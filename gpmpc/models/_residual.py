@@ -27,8 +27,8 @@ from gpmpc._dynamics import (
     tensors_for,
     to_array,
 )
-from gpmpc.exceptions import SettingError, ShapeError
-from gpmpc.gaussian import Gaussian, check_tensors
+from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
+from gpmpc.gaussian import Gaussian, check_covariance, check_tensors
 from gpmpc.gp import (
     GPPosterior,
     SlidingWindow,
@@ -65,7 +65,7 @@ class ResidualModel(TensorModel):
     Raises:
         ShapeError: The parts do not belong together.
         SettingError: The residual predicts something else, an index is out of range, or
-            the noise is missing.
+            the noise is missing or no covariance.
 
     >>> from gpmpc.datasets import RandomData
     >>> from gpmpc.gp import Trainer
@@ -150,10 +150,11 @@ class ResidualModel(TensorModel):
         m = self.input_dim
         if not callable(self.B):
             self._check_tensor("B", self.B, (n, self.residual.output_dim))
-        if self.noise is not None:
-            self._check_tensor("noise", self.noise, (n, n))
-        if self.observation_noise is not None:
-            self._check_tensor("observation_noise", self.observation_noise, (n, n))
+        for key in ("noise", "observation_noise"):
+            covariance = getattr(self, key)
+            if covariance is not None:
+                self._check_tensor(key, covariance, (n, n))
+                check_covariance(key, covariance)
         if isinstance(self.nominal, Affine):
             self._check_tensor("nominal.A", self.nominal.A, (n, n))
             self._check_tensor("nominal.B", self.nominal.B, (n, m))
@@ -225,8 +226,12 @@ class ResidualModel(TensorModel):
 
         Raises:
             ShapeError: The transitions have other dimensions.
+            UnsupportedModel: The residual is no ``GPPosterior``.
         """
         check_transitions(transitions, self)
+        if not isinstance(self.residual, GPPosterior):
+            rule = "points can be appended to a residual that is a GPPosterior"
+            raise UnsupportedModel(f"{rule}; got {type(self.residual).__name__}")
         features, targets = residual_data(
             nominal=self.nominal,
             B=self.B,
@@ -369,9 +374,10 @@ class ResidualModel(TensorModel):
     def affine_form(self) -> AffineForm | None:
         """The parts of the model for compiled code and exact moments.
 
-        None unless B is constant, and the nominal model ``Affine`` or a tape.
+        None unless B is constant, the nominal model ``Affine`` or a tape, and the
+        residual a ``GPPosterior``.
         """
-        if callable(self.B):
+        if callable(self.B) or not isinstance(self.residual, GPPosterior):
             return None
         form = AffineForm(
             self.residual,

@@ -5,6 +5,7 @@ rates, a nominal model is right but for what it misses. One place for Python and
 command line.
 """
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Literal, cast
@@ -25,6 +26,8 @@ from gpmpc.models._kinematic_rates import (
 from gpmpc.models._residual import ResidualModel, train_residual
 from gpmpc.models._residual_data import Nominal
 from gpmpc.systems import System
+
+_log = logging.getLogger(__name__)
 
 KinematicsChoice = Literal["integrated", "learned"]
 KINEMATICS = ("integrated", "learned")
@@ -54,8 +57,9 @@ def train(
         transitions: The data.
         system: What they were recorded of. Its dynamics are not used.
         trainer: A ``Trainer`` or ``SparseTrainer``; by default a ``Trainer`` of
-            ``settings``. One that predicts ``"next_state"`` learns the states as they
-            stand.
+            ``settings`` with ``scaling=standardize``. One that was told to predict
+            ``"next_state"`` learns the states as they stand, without angles, rates and
+            nominal model.
         kinematics: ``"integrated"``, or ``"learned"`` like all other states.
         seed: Of the training's random numbers.
         settings: Of a ``Trainer``, such as ``restarts=1``.
@@ -91,11 +95,10 @@ def train(
     check_kind("system", system, System, example)
     transitions = _named(transitions, system)
     if trainer is None:
-        defaults: dict[str, Any] = {
-            "predicts": "difference",
-            "scaling": standardize,
-        }
-        trainer = Trainer(**(defaults | settings))
+        settings.setdefault("scaling", standardize)
+        trainer = Trainer(**settings)
+    if getattr(trainer, "predicts", "next_state") is None:
+        trainer = replace(cast(Any, trainer), predicts="difference")
     return _train_on_system(transitions, system, trainer, kinematics, seed)
 
 
@@ -136,6 +139,13 @@ def _train_on_system(
         lengthscales = _prior_lengthscales(system, learns_residual)
         trainer = replace(trainer, prior_lengthscale=lengthscales)
     if not learns_residual:
+        if system.nominal is not None:
+            _log.warning(
+                "training: the nominal model of %s is not used, since the trainer "
+                "does not predict differences; predicts='difference' learns what it "
+                "misses",
+                system.name,
+            )
         return trainer(transitions, seed=seed)
     nominal = _nominal_of(system)
     if not integrates:

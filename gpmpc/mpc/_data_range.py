@@ -13,7 +13,7 @@ from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, to_array
 from gpmpc.exceptions import ShapeError
 from gpmpc.gp import GPPosterior
-from gpmpc.models import LogDynamics, ResidualModel, RigidBodyKinematics
+from gpmpc.models import LogDynamics, RigidBodyKinematics
 from gpmpc.models._past import measured_dim, measured_signals
 from gpmpc.mpc._controller import read_reference
 from gpmpc.signals import signals_of
@@ -121,8 +121,9 @@ def _columns(model: Any) -> list[_Column]:
         return _columns_of(model, list(range(model.state_dim)), [])
     if isinstance(model, LogDynamics):
         return _columns_of_log(model)
-    if isinstance(model, ResidualModel):
-        return _columns_of(model.residual, list(model.states), list(model.angles))
+    gp: Any = getattr(model, "residual", None)
+    if isinstance(gp, GPPosterior):
+        return _columns_of(gp, list(model.states), list(model.angles))
     within = getattr(model, "model", None)
     return [] if within is None else _columns(within)
 

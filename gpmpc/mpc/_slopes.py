@@ -27,8 +27,8 @@ def slope_covariances(model: Any, state: Array, input: Array) -> Array:
     """Returns covariances (n, n + m, n + m) of each next state's derivatives.
 
     They are derivatives by state and input, and covariances by the GPs' own
-    uncertainty: zero for models without GPs, and for those whose residual acts through
-    a function of the state.
+    uncertainty: zero for models without a ``GPPosterior``, and for those whose residual
+    acts through a function of the state.
 
     Args:
         model: Learned or known; delays and disturbances around it are looked through.
@@ -39,7 +39,8 @@ def slope_covariances(model: Any, state: Array, input: Array) -> Array:
         return _gp_covariances(model, np.concatenate([state, input]))
     if isinstance(model, LinearWrapper):
         return _wrapper_covariances(model, state, input)
-    if isinstance(model, ResidualModel) and not callable(model.B):
+    gp: Any = getattr(model, "residual", None)
+    if isinstance(gp, GPPosterior) and not callable(model.B):
         return _residual_covariances(model, to_array(model.B), state, input)
     size = len(state) + len(input)
     return np.zeros((len(state), size, size))

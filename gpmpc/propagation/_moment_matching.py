@@ -14,6 +14,7 @@ Derivatives follow by the product rule; those by S are kept symmetric in their l
 indices. M, V and J are ``_moments``'.
 """
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -122,11 +123,10 @@ class MomentMatching(NoisyPropagator):
 
         _, mean, covariance, control = arrays
         batch = mean.shape[:-1]
-        points = mean.reshape(-1, mean.shape[-1])
-        H = len(points)
+        H = math.prod(batch)
         matched = kernels.moments(
             f.packed,
-            mu=points,
+            mu=mean.reshape(H, mean.shape[-1]),
             S=covariance.reshape(H, *covariance.shape[-2:]),
             u=control.reshape(H, control.shape[-1]),
             diagonal=self.diagonal,

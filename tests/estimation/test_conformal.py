@@ -163,6 +163,15 @@ def test_only_directions_count_in_which_a_plan_touches_a_bound():
     assert tube.counts.tolist() == [3]
 
 
+def test_a_state_that_is_not_measured_hides_no_bound_on_another():
+    tube = AdaptiveTube(ConformalTube(np.ones((19, 1)), np.eye(2)), 0.9, largest=5.0)
+    tube.remember(
+        np.zeros((2, 2)), np.tile(0.01 * np.eye(2), (2, 1, 1)), [[True, False]]
+    )
+    tube.observe([100.0, np.nan])
+    assert (tube.counts.tolist(), tube.misses.tolist()) == ([1], [1])
+
+
 def test_plans_compare_at_their_stage_without_failed_steps():
     tube = AdaptiveTube(ConformalTube(np.ones((19, 3)), [[1.0]]), 0.9, largest=5.0)
     covariances = np.ones((4, 1, 1))

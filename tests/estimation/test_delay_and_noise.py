@@ -127,6 +127,10 @@ OTHER = np.random.default_rng(3).normal(size=(300, 1))
         ),
         (lambda x, u: (0 * x + 1, u), "no state moves"),
         (
+            lambda x, u: (x, np.eye(300, 1, -3)),  # one pulse, near the beginning
+            "input 1 of 0 steps before is constant in the rows",
+        ),
+        (
             lambda x, u: feedback_alone(300, 0, 1.0),
             "input 1 of 0 steps before is a function of the state",
         ),
@@ -319,6 +323,17 @@ def test_with_process_noise_widens_tubes_and_keeps_the_data():
     )
 
 
+def test_an_output_without_an_error_keeps_the_noise_that_it_has():
+    states, inputs = log(60, 0, 1)
+    states[:, 0] = 0.0
+    data = transitions(states, inputs)
+    model = Trainer(predicts="difference", restarts=0)(data).posterior
+    noise = estimate_process_noise(model, data)
+    assert noise.variance[0] == 0
+    kept = with_process_noise(model, noise).noise_variance
+    assert kept.tolist() == [model.noise_variance[0], noise.variance[1]]
+
+
 def test_rows_in_no_order_of_time_have_no_correlation():
     data = transitions(*log(60, 0, 1))
     model = Trainer(predicts="difference", restarts=0)(data).posterior
@@ -346,6 +361,8 @@ def test_misuse_is_refused():
     ).posterior
     with pytest.raises(UnsupportedModel, match="train a sparse one again"):
         with_process_noise(sparse, torch.ones(2))
+    with pytest.raises(SettingError, match="noise: must be a torch tensor; got list"):
+        with_process_noise(model, [0.1, 0.1])
     with pytest.raises(
         ShapeError, match=r"must be one log; got \(61, 2\) and \(50, 1\)"
     ):

@@ -424,6 +424,22 @@ def test_a_smoother_keeps_its_digits_under_a_flat_prior():
     assert (torch.linalg.eigvalsh(runs[1].covariance) > 0).all()
 
 
+def test_sigma_points_of_negative_weight_take_no_noise_from_a_sensor():
+    n = 6
+    observer = Unscented(kappa=3.0 - n)
+    squares = Measurement(
+        n, torch.eye(1, dtype=F), lambda x: x.square().sum(-1, keepdim=True)
+    )
+    plant = Known(lambda x, u: x, [0.1] * n)
+    prior = Gaussian(
+        torch.tensor([3.0] + [0.0] * (n - 1), dtype=F), torch.eye(n, dtype=F)
+    )
+    update = KalmanFilter(plant, squares, observer=observer).update(prior, [9.0])
+    # To first order y = 6 x_1: what the points find of Cov[y], 18, is less than 36.
+    assert update.belief.covariance[0, 0].item() == pytest.approx(1 - 36 / 37)
+    assert update.covariance.item() == pytest.approx(37)
+
+
 @pytest.mark.parametrize("variance", [1e-8, 1e-12, 1e-16, 1e-20, 1e-26])
 def test_contradictory_good_sensors_move_other_states_little(variance):
     P = random_covariance(5, 1.0)
@@ -548,6 +564,30 @@ def test_white_innovations_of_correlated_sensors_are_white():
             ),
             SettingError,
             "measurement: must be torch.float64 on cpu like the model",
+        ),
+        (
+            lambda m: replace(m, noise_covariance=torch.tensor([[-1e-4]], dtype=F)),
+            SettingError,
+            "noise_covariance: must have variances of zero or more",
+        ),
+        (
+            lambda m: replace(m, noise_covariance=torch.tensor([[np.nan]], dtype=F)),
+            SettingError,
+            "noise_covariance: must hold finite real numbers",
+        ),
+        (
+            lambda m: replace(
+                m, noise_covariance=torch.tensor([[1.0, 0.5], [0.4, 1.0]], dtype=F)
+            ),
+            SettingError,
+            "noise_covariance: must be symmetric",
+        ),
+        (
+            lambda m: replace(
+                m, noise_covariance=torch.tensor([[1.0, 2.0], [2.0, 1.0]], dtype=F)
+            ),
+            SettingError,
+            "must be positive semidefinite; .* eigenvalue -1",
         ),
         (
             lambda m: LateMeasurements(LINEAR, PRIOR),

@@ -2,6 +2,7 @@
 kernel."""
 
 import gpytorch
+import numpy as np
 import pytest
 import torch
 from gpytorch.kernels import (
@@ -20,14 +21,26 @@ from packaging.version import Version
 from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import Hyperparameters, KernelPosterior, exact_inference, from_gpytorch
+from gpmpc.gp import (
+    Hyperparameters,
+    KernelPosterior,
+    Transitions,
+    exact_inference,
+    from_gpytorch,
+)
 from gpmpc.gp._sparse import collapsed_bound
+from gpmpc.gp.casadi_ import casadi_function
+from gpmpc.models import Affine, ResidualModel
+from gpmpc.models._roll_out import RollOut
+from gpmpc.mpc import beyond_data
+from gpmpc.mpc._slopes import slope_covariances
 from gpmpc.propagation import (
     Linearization,
     MeanEquivalence,
     MomentMatching,
     MonteCarlo,
     Unscented,
+    best_propagator,
     differentiate,
 )
 
@@ -255,6 +268,28 @@ def test_moment_matching_says_what_other_kernels_allow():
         MomentMatching()(
             matern_dynamics(), Gaussian(torch.zeros(2), torch.eye(2)), torch.zeros(1)
         )
+
+
+def test_a_residual_of_any_kernel_is_rolled_out_and_not_taken_for_a_posterior():
+    model = ResidualModel(
+        nominal=Affine.identity(2, 1),
+        residual=matern_dynamics("value"),
+        B=torch.eye(2),
+        states=[0, 1],
+        inputs=[0],
+        input_dim=1,
+    )
+    assert isinstance(best_propagator(model), Unscented)
+    RollOut(model)
+    x = np.array([[0.2, -0.4]])
+    u = np.array([[0.1]])
+    assert not slope_covariances(model, x[0], u[0]).any()
+    assert beyond_data(model, [100.0, 0.0]) == []
+    data = Transitions(x, u, x)
+    with pytest.raises(UnsupportedModel, match="GPPosterior; got KernelPosterior"):
+        model.append(data)
+    with pytest.raises(UnsupportedModel, match="nominal Affine and a KernelPosterior"):
+        casadi_function(model)
 
 
 def test_a_frozen_model_knows_its_sizes_noise_type_and_moves():

@@ -89,6 +89,7 @@ def test_far_from_the_data_the_prior_returns():
             ShapeError,
             r"targets must have shape \(10, 2\); got \(9, 2\)",
         ),
+        ({"targets": torch.tensor(1.0)}, ShapeError, r"need two .* and \(\)"),
         (
             {"noise_variance": torch.zeros(2)},
             SettingError,
@@ -147,9 +148,9 @@ def test_misuse_is_refused_with_the_rule(change, error, message):
             r"offset must have shape \(2,\); got \(3,\)",
         ),
         (
-            {"input_dim": 3, "predicts": "value"},
+            {"input_dim": 4, "predicts": "value"},
             ShapeError,
-            "3 controls; got 3 columns and 2 outputs",
+            "4 controls; got 3 columns and 2 outputs",
         ),
     ],
 )

@@ -24,6 +24,8 @@ def test_standardized_columns_have_mean_zero_and_deviation_one():
     scaled = standardize(COLUMNS, NAMES).scale(COLUMNS)[:, [0, 2]]
     assert torch.allclose(scaled.mean(0), torch.zeros(2), atol=1e-14)
     assert torch.allclose(scaled.std(0, correction=0), torch.ones(2))
+    tiny = torch.tensor([[0.0], [1e-170]])  # its square is no number
+    assert standardize(tiny, ["d"]).factor.tolist() == [1.0]
 
 
 def test_min_max_fills_the_interval_constants_its_middle():

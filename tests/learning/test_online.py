@@ -17,6 +17,8 @@ from gpmpc.learning import (
     OnlineLearning,
     learn_from_step,
 )
+from gpmpc.learning._innovation import LearningStep
+from gpmpc.learning._state import Expectation
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc import GPMPC, Box, ControlLoop, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
@@ -33,19 +35,18 @@ def cart(x, u, gain=1.0, wind=0.0):
     return np.array([x[0] + STEP * rate, rate])
 
 
-def learned_model():
+def training_data():
     rng = np.random.default_rng(0)
     x = rng.uniform(-2, 2, (60, 2))
     u = rng.uniform(-4, 4, (60, 1))
     after = np.array(
         [cart(a, b) + rng.normal(0, NOISE) for a, b in zip(x, u, strict=True)]
     )
-    return Trainer(predicts="difference", restarts=0)(
-        Transitions(x, u, after)
-    ).posterior
+    return Transitions(x, u, after)
 
 
-MODEL = learned_model()
+DATA = training_data()
+MODEL = Trainer(predicts="difference", restarts=0)(DATA).posterior
 
 
 def flown(learning, changed=None, steps=120, seed=0, sensor=0.0):
@@ -287,6 +288,28 @@ def test_an_older_change_stays_and_can_go_another_way():
     for model, (cholesky, weights) in zip(models[1:], copies, strict=True):
         assert np.array_equal(model.posterior.cholesky, cholesky)
         assert np.array_equal(model.posterior.weights, weights)
+
+
+def test_a_step_is_expected_with_the_noise_of_states_that_no_gp_has():
+    effect = torch.tensor([[0.05], [1.0]])
+    gp = ResidualModel.train(
+        Affine.identity(2, 1), DATA, effect, trainer=Trainer(restarts=0)
+    )
+    noise = gp.noise_covariance + torch.diag(torch.tensor([0.3, 0.0]))
+    changed = ChangedModel(replace(gp, noise=noise))
+    state = LearningState.begin(changed, np.zeros(2))
+    step = LearningStep(
+        state=np.zeros(2),
+        input=np.zeros(1),
+        next_state=np.zeros(2),
+        point=np.zeros(4),
+        error=np.zeros(1),
+        latent_variance=np.zeros(1),
+        noise_variance=changed.gp_noise,
+    )
+    expected = state.expect(Expectation.certain(np.zeros(2)), step)
+    latent = gp.predict(torch.zeros(2), torch.zeros(1)).covariance
+    assert np.allclose(expected.covariance, (latent + noise).numpy())
 
 
 def test_what_cannot_be_learned_is_refused():

@@ -10,7 +10,14 @@ from gpmpc.estimation import Measurement
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, SlidingWindow, SparseTrainer, Trainer, Transitions
-from gpmpc.models import Affine, DelayedModel, KnownModel, ResidualModel
+from gpmpc.models import (
+    Affine,
+    DelayedModel,
+    KnownModel,
+    ResidualModel,
+    load_model,
+    save_model,
+)
 from gpmpc.propagation import (
     Linearization,
     MeanEquivalence,
@@ -64,6 +71,34 @@ def test_a_prediction_is_nominal_plus_residual_where_it_acts(nominal):
     assert torch.allclose(
         model().noise_covariance, B @ torch.diag(torch.tensor([1e-3, 2e-3])) @ B.T
     )
+
+
+def test_a_residual_may_depend_on_inputs_alone(tmp_path):
+    generator = torch.Generator().manual_seed(0)
+    x = torch.rand(40, 3, generator=generator)
+    u = 4 * torch.rand(40, 2, generator=generator) - 2
+    effect = torch.tensor([[0.0], [1.0], [0.5]])
+    after = AFFINE(x, u) + 0.1 * torch.sin(u[:, :1]) @ effect.T
+    learned = ResidualModel.train(
+        AFFINE,
+        Transitions(x, u, after),
+        B=effect,
+        states=[],
+        inputs=[0],
+        trainer=Trainer(restarts=0),
+    )
+    assert learned.residual.state_dim == 0
+    control = torch.tensor([0.7, 0.0])
+    expected = belief()
+    exact = AFFINE(expected.mean, control) + 0.1 * effect[:, 0] * torch.sin(control[0])
+    for propagator in (MomentMatching(), Unscented(), Linearization()):
+        moved = propagator(learned, expected, control)
+        assert torch.allclose(moved.mean, exact, atol=1e-3)
+        covariance = A @ expected.covariance @ A.T
+        assert torch.allclose(moved.covariance, covariance, atol=1e-4)
+    save_model(learned, tmp_path / "model.npz")
+    loaded = load_model(tmp_path / "model.npz")
+    assert torch.equal(loaded.predict(x, u).mean, learned.predict(x, u).mean)
 
 
 @pytest.mark.parametrize("nominal", [AFFINE, nonlinear])
@@ -264,6 +299,11 @@ def test_any_trainer_learns_residuals_and_nothing_else_does():
             {"B": torch.ones(3, 3)},
             ShapeError,
             r"B must have shape \(3, 2\); got \(3, 3\)",
+        ),
+        (
+            {"noise": -torch.eye(3)},
+            SettingError,
+            "noise: must have variances of zero or more",
         ),
         (
             {"residual": GPPosterior(**(vars(gp()) | {"predicts": "difference"}))},

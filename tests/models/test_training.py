@@ -205,11 +205,21 @@ def test_without_a_system_states_are_numbers():
     assert isinstance(plain, GPPosterior)
 
 
-def test_a_sparse_trainer_serves_as_well():
-    trainer = SparseTrainer(predicts="difference", inducing=20, scaling=standardize)
+@pytest.mark.parametrize("told", [{"predicts": "difference"}, {}], ids=["told", ""])
+def test_a_sparse_trainer_serves_as_well(told):
+    trainer = SparseTrainer(inducing=20, scaling=standardize, **told)
     plant = pendulum()
     training = train(rows(plant), system=plant, trainer=trainer)
     assert isinstance(training.posterior, ResidualModel)
+    assert training.posterior.residual.output_dim == 1
+    assert training.posterior.angles == [0]
+
+
+def test_a_nominal_model_that_is_not_used_is_said_in_the_log(caplog):
+    plant = replace(pendulum(), nominal=pendulum())
+    trainer = Trainer(predicts="next_state", **QUICK)
+    train(rows(plant, size=20), system=plant, trainer=trainer)
+    assert "the nominal model of pendulum is not used" in caplog.text
 
 
 def test_what_does_not_belong_together_is_refused():
