@@ -443,7 +443,7 @@ def test_a_locked_input_takes_no_programs_at_rest():
     upright = np.array([np.pi, 0.0])
     decision = None
     for k in range(4):
-        almost = Gaussian.certain(upright + [1e-12 * (-1) ** k, 1e-13])
+        almost = Gaussian.certain(upright + np.array([1e-12 * (-1) ** k, 1e-13]))
         decision = controller.control(almost, Reference(upright), decision)
         assert decision.status is Status.SOLVED
         assert decision.iterations <= 2
