@@ -22,8 +22,14 @@ def read(path):
     return (ROOT / path).read_text()
 
 
-def follow(path, folder, section=""):
+def follow(path, folder, section="", shortened=()):
     """Does what a page, or what follows a heading of it, says in a folder.
+
+    Args:
+        path: Of the page.
+        folder: In which it is followed.
+        section: The heading.
+        shortened: Words of commands and their replacements, for long flights.
 
     Returns:
         The names that its Python leaves, and what each command printed.
@@ -39,6 +45,9 @@ def follow(path, folder, section=""):
         elif language == "python":
             exec(compile(text, path, "exec"), names)
         elif not language:
+            for words, fewer in shortened:
+                assert words in read(path)
+                text = text.replace(words, fewer)
             printed += _run(text, folder)
     return names, printed
 

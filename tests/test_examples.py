@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from gpmpc import plotting
 from gpmpc.gp import Transitions, load_posterior
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -97,6 +98,12 @@ def test_a_mujoco_quadrotor_flies_better_by_logs_than_data_sheet(tmp_path):
 
 def test_the_example_of_a_payload_learns_and_corrects(tmp_path, monkeypatch):
     pytest.importorskip("mujoco")
+    whole_film = plotting.film
+
+    def short_film(run, system, path, frames, enlarged):
+        whole_film(run, system, path, frames=frames // 6, enlarged=enlarged)
+
+    monkeypatch.setattr(plotting, "film", short_film)
     monkeypatch.setattr(sys, "argv", ["payload.py", str(tmp_path)])
     errors = [
         *runpy.run_path(str(EXAMPLES / "payload.py"), run_name="__main__")[
@@ -107,7 +114,7 @@ def test_the_example_of_a_payload_learns_and_corrects(tmp_path, monkeypatch):
     assert errors[2] < errors[1] / 3 < errors[0] / 3
     assert (tmp_path / "payload.png").stat().st_size > 10_000
     film = tmp_path / "payload.gif"  # where MuJoCo renders without a screen
-    assert not film.exists() or film.stat().st_size > 100_000
+    assert not film.exists() or film.stat().st_size > 20_000
 
 
 def test_the_example_of_a_wall_keeps_its_promised_probability(

@@ -54,8 +54,10 @@ def test_the_guide_of_a_custom_system_runs_from_start_to_end(page, tmp_path):
 def test_simulators_are_systems(page):
     pytest.importorskip("gymnasium")
     pytest.importorskip("mujoco")
-    names, (flown, quadrotor, filmed) = page("docs/guide_simulator.md")
-    assert "100 steps of mujoco_quadrotor with convex" in quadrotor
+    names, (flown, quadrotor, filmed) = page(
+        "docs/guide_simulator.md", shortened=[("steps=100", "steps=20")]
+    )
+    assert "20 steps of mujoco_quadrotor with convex" in quadrotor
     assert "flight.gif" in filmed
     assert abs(names["flown"].rollout.states[-20:] - [1.0, 0.0, 0.0]).max() < 0.05
     assert "5 steps of gymnasium with convex" in flown

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from matplotlib.animation import FFMpegWriter, FuncAnimation, PillowWriter
+from matplotlib.animation import FFMpegWriter, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
@@ -91,14 +91,16 @@ def save_animation(
     frame_count = min(most_frames, steps)
     frames = np.unique(np.linspace(0, steps - 1, frame_count).astype(int))
     writer_class = FFMpegWriter if Path(path).suffix == ".mp4" else PillowWriter
-    animation = FuncAnimation(
-        figure, draw, frames=frames, blit=False, cache_frame_data=False
-    )
+    writer = writer_class(fps=_FRAME_RATE)
     path = Path(path)
     # The writers know files by their names alone.
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder, path.name)
-        animation.save(str(draft), writer_class(fps=_FRAME_RATE), dpi=_DPI)
+        # Matplotlib's FuncAnimation would draw every frame twice.
+        with writer.saving(figure, str(draft), _DPI):
+            for step in frames:
+                draw(int(step))
+                writer.grab_frame()
         write_whole(path, draft.read_bytes())
 
 

@@ -56,9 +56,11 @@ def by_hydra(words, name="run"):
 
 def test_all_settings_are_those_that_hydra_composes():
     shared = composer()
-    for words in [*MANY, *MANY]:  # once composed, and once taken from what was
+    expected = [by_hydra(words) for words in MANY]
+    # once composed, and once taken from what was
+    rounds = [*zip(MANY, expected, strict=True)] * 2
+    for words, (config, options) in rounds:
         composed = shared.composed(words)
-        config, options = by_hydra(words)
         assert composed.config() == config, words
         assert dict(composed.options) == options
         one, other = (OmegaConf.to_yaml(each) for each in (composed.config(), config))
