@@ -98,10 +98,13 @@ class LearningController:
             return LearningState.begin(self._model, measured)
         if not is_measured(measured).all():
             return learned.later()
-        if not np.array_equal(previous.means[0], learned.state):
+        input = learned.input_of_policy
+        if np.array_equal(previous.means[0], learned.state):
+            input = previous.input  # that of a decision at the last measurement
+        if input is None:
             return learned.after_gap(measured)
         try:
-            return learn_from_step(learned, previous.input, measured)
+            return learn_from_step(learned, input, measured)
         except (SettingError, DataError):
             # The points contradict each other beyond double precision.
             return LearningState.begin(self._model, measured, learned.version + 1)

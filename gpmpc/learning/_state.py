@@ -48,7 +48,7 @@ class LearningState:
     """
 
     model: ChangedModel  #: the model with its change
-    state: Array  #: measured at the last step (n,)
+    state: Array  #: the last one that was measured (n,)
     #: of the model alone in the last step, as far as a change can explain it (k,); NaN
     #: where it is unknown
     error: Array
@@ -64,6 +64,9 @@ class LearningState:
     #: steps that nothing has explained, less those that went as predicted since then
     unexplained_steps: int = 0
     doubt: Doubt | None = None  #: where the last measurement is held back
+    #: what a loop applied at ``state`` in the place of a decision that failed there
+    #: (m,); None where no decision failed, or ``state`` is older than a step
+    input_of_policy: Array | None = None
 
     @classmethod
     def begin(
@@ -103,7 +106,11 @@ class LearningState:
 
     def later(self) -> "LearningState":
         """Returns the same a step later."""
-        return replace(self, model=self.model.later(1.0))
+        return replace(self, model=self.model.later(1.0), input_of_policy=None)
+
+    def with_input_of_policy(self, input: Array) -> "LearningState":
+        """Returns the same where a loop applies another input than was decided."""
+        return replace(self, input_of_policy=input)
 
     def with_measurement(
         self, state: Array, error: Array, noise_ratios: Array

@@ -20,6 +20,7 @@ from scipy.stats import chi2
 
 from gpmpc._arrays import UNMEASURED
 from gpmpc._compiled import compiled, njit_noalloc
+from gpmpc.mpc._controller import KEPT
 
 Array = np.ndarray
 
@@ -42,7 +43,6 @@ _BROKEN = 4.0  # how many times a promise may be paid
 _MATERIAL = 0.02  # share of the way travelled below which no distance matters
 _FEW = 3  # steps of a window: failures, or plans far from the data
 _FAR = 0.9  # novelty from which on a model says little more than before any data
-_VIOLATED = 1e-6  # violation of a constraint from which on it counts as missed
 _CLIMBED = 0.1  # of its first cost, from which on plans that cost ever more count
 _RISEN = 2.0  # of its first cost, from which on they are lost
 _ROUNDING = 1e-9
@@ -100,9 +100,11 @@ FLIGHT_MEMORY = np.dtype(
     [
         ("step", np.int64),  # number of the step, from 0
         ("changes", np.int64),  # steps so far in which any state had a change
+        ("horizon", np.int64),  # of the last plan that was applied; 0 at first
         ("look_ahead", np.int64),  # steps that a promise is followed for; 0 at first
         ("since_news", np.int64),  # steps since the reference's end has moved
-        ("since_nearer", np.int64),  # steps since the plant came nearer to it
+        # steps since the plant came nearer to it, or was there
+        ("since_nearer", np.int64),
         ("violated", np.int64),  # steps for which plans have missed a constraint
         ("lost", np.int64),  # why it is lost, or ``HEALTHY``
         # the first alarm of the last step, as in ``Alarm``
@@ -111,10 +113,11 @@ FLIGHT_MEMORY = np.dtype(
         ("value", np.float64),
         ("longest_way", np.float64),  # from the start to the reference's end
         ("distance_when_lost", np.float64),
+        ("cost_ratio_when_lost", np.float64),  # of the last plan since then
         ("first_violation", np.float64),
         ("first_cost", np.float64),  # largest of the first plans to a new reference
         ("awaits_cost", np.int64),  # 1 until there is a plan to the last news
-        ("nearest", np.float64),  # distance
+        ("nearest", np.float64),  # distance on the way there; infinite at rest
         ("distances", np.float64, _RING),
         ("costs", np.float64, _RING),  # of plans
         # modulo look_ahead: squared moves of the reference's end
@@ -145,7 +148,8 @@ class Memory(NamedTuple):
 
     states: Array  # (n,) of ``STATE_MEMORY``
     flight: Array  # (1,) of ``FLIGHT_MEMORY``
-    at_bound: Array  # for how many steps each input has stayed at a bound (m,)
+    # for how many steps each input has stayed at a bound away from the reference (m,)
+    at_bound: Array
     distance_at_bound: Array  # when each input came to its bound (m,)
 
 
@@ -154,12 +158,12 @@ class Reading(NamedTuple):
 
     measured: Array  # (n,)
     reference: Array  # from this step on, to its end or as far as known (H + 1, n)
-    means: Array  # of the plan (H + 1, n); anything without one
-    covariances: Array  # (H + 1, n, n)
-    input: Array  # applied now (m,)
+    means: Array  # of the plan (H + 1, n); two rows of NaN without one
+    covariances: Array  # likewise (H + 1, n, n)
+    input: Array  # applied until the next step, whoever chose it (m,); NaN if unknown
     is_applied: bool  # whether the plan is
-    novelty: float
-    violation: float
+    novelty: float  # of the plan; NaN if unknown
+    violation: float  # likewise
 
 
 class Alarm(NamedTuple):
@@ -248,11 +252,12 @@ def judge_step(
     if not _fit_each_other(memory, reading):
         return MISFIT
     flight = memory.flight[0]
-    horizon = len(means) - 1
     _remember_measurement(memory, measured)
     planned_squares, promised = _plan_distances(settings, reading)
-    if flight.look_ahead == 0 and reading.is_applied:
-        flight.look_ahead = min(horizon, _LONG)
+    if reading.is_applied:
+        flight.horizon = len(means) - 1
+    if flight.look_ahead == 0:
+        flight.look_ahead = min(flight.horizon, _LONG)
 
     # The order counts: sensor variances come from the innovations, distances need these
     # variances, and a promise is followed after the news that may withdraw it.
@@ -261,7 +266,7 @@ def judge_step(
     distance = _follow_distance(settings, memory, reading.reference)
     _remember_reference(settings, memory, reading.reference)
     _remember_first_cost(flight, planned_squares)
-    promise_ratio = _follow_promise(flight, distance, promised, horizon)
+    promise_ratio = _follow_promise(flight, distance, promised)
     course = _follow_course(flight, distance, planned_squares, promise_ratio)
     far_plans = _follow_novelty(flight, reading.novelty)
     predicts_well = (
@@ -270,8 +275,8 @@ def judge_step(
     lost = _follow_loss(flight, course, planned_squares, predicts_well)
     failures = _follow_failures(flight, reading.is_applied)
     violation = _follow_violation(flight, reading.violation)
-    standing = _follow_approach(flight, distance, horizon)
-    saturated = _follow_bounds(settings, memory, reading.input, distance, horizon)
+    standing = _follow_approach(flight, distance)
+    saturated = _follow_bounds(settings, memory, reading.input, distance)
     alarms = (  # in the order in which they are named
         lost,
         frozen,
@@ -663,7 +668,7 @@ def _plan_distances(settings, reading):
 
 
 @njit_noalloc
-def _follow_promise(flight, distance, promised, horizon):
+def _follow_promise(flight, distance, promised):
     """What steps cost over what a plan promised for them; 0 where it is not known.
 
     In optimal control the cost falls by what is paid (Gruene and Rantzer, 2008,
@@ -681,7 +686,7 @@ def _follow_promise(flight, distance, promised, horizon):
     # The slot still holds what step k - h promised. Noise was not promised, nor what
     # prepares for a reference that is known later.
     allowed = flight.promised[slot] + 0.25 * h * distance.least * distance.least
-    is_comparable = min(horizon, _LONG) == h
+    is_comparable = min(flight.horizon, _LONG) == h
     flight.promised[slot] = promised if is_comparable else np.nan
     if k < h or flight.changes <= _FEWEST:  # the noise is not known yet
         return 0.0
@@ -752,7 +757,9 @@ def _follow_loss(flight, course, planned_squares, predicts_well):
     if flight.lost == AWAY:
         return Alarm(AWAY, 0, course.distance)
     if flight.lost == RISING:
-        return Alarm(RISING, 0, planned_squares / flight.first_cost)
+        if planned_squares == planned_squares:
+            flight.cost_ratio_when_lost = planned_squares / flight.first_cost
+        return Alarm(RISING, 0, flight.cost_ratio_when_lost)
     return _WELL
 
 
@@ -802,8 +809,13 @@ def _check_novelty(flight, course, far_plans, novelty):
 
 @njit_noalloc
 def _follow_violation(flight, violation):
-    """Plans that have missed a constraint for long, the last no less than the first."""
-    if not violation > _VIOLATED:
+    """Plans that have missed a constraint for long, the last no less than the first.
+
+    A step without a plan, or whose violation is unknown, does not count.
+    """
+    if violation != violation:
+        return _WELL
+    if violation <= KEPT:
         flight.violated = 0
         return _WELL
     if flight.violated == 0:
@@ -816,24 +828,41 @@ def _follow_violation(flight, violation):
 
 
 @njit_noalloc
-def _follow_approach(flight, distance, horizon):
-    """No way made for long, while half of it is still ahead."""
+def _follow_approach(flight, distance):
+    """No way made for long, while half of it is still ahead.
+
+    Steps at rest are no steps on the way: what is pushed away then begins a new one.
+    """
+    if distance.now <= distance.least:
+        flight.nearest = np.inf
+        flight.since_nearer = 0
+        return _WELL
     if distance.now < 0.9 * flight.nearest or flight.since_news == 0:
         flight.nearest = distance.now
         flight.since_nearer = 0
         return _WELL
     flight.since_nearer += 1
-    is_far = distance.now > max(distance.least, 0.5 * flight.longest_way)
-    if is_far and flight.since_nearer > 3 * max(_LONG, horizon):
+    is_far = distance.now > 0.5 * flight.longest_way
+    if is_far and flight.since_nearer > 3 * max(_LONG, flight.horizon):
         return Alarm(STANDING, 0, float(flight.since_nearer))
     return _WELL
 
 
 @njit_noalloc
-def _follow_bounds(settings, memory, input, distance, horizon):
-    """An input that has stayed at a bound for long while the distance did not fall."""
+def _follow_bounds(settings, memory, input, distance):
+    """An input that has stayed at a bound for long while the distance did not fall.
+
+    At rest an input may be at a bound, such as a brake; one that is not known does not
+    count.
+    """
     alarm = _WELL
+    long = 2 * max(_LONG, memory.flight[0].horizon)
     for j in range(len(settings.lower)):
+        if distance.now <= distance.least:
+            memory.at_bound[j] = 0
+            continue
+        if input[j] != input[j]:
+            continue
         size = _ROUNDING * max(1.0, abs(input[j]))
         is_low = input[j] <= settings.lower[j] + size
         if is_low or input[j] >= settings.upper[j] - size:
@@ -843,9 +872,8 @@ def _follow_bounds(settings, memory, input, distance, horizon):
             memory.at_bound[j] += 1
         else:
             memory.at_bound[j] = 0
-        is_long = memory.at_bound[j] > 2 * max(_LONG, horizon)
         is_nearer = distance.now < 0.95 * memory.distance_at_bound[j]
-        if is_long and distance.now >= distance.least and not is_nearer:
+        if memory.at_bound[j] > long and not is_nearer:
             alarm = Alarm(SATURATED, j, float(memory.at_bound[j]))
     return alarm
 

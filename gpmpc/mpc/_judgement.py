@@ -115,7 +115,8 @@ class FlightJudge:
             numbers.
 
     Raises:
-        ShapeError: The noise is of another number of states.
+        ShapeError: The noise is of another number of states, or the names of other
+            numbers of states or inputs.
 
     Attributes:
         last: Judgement of the last step.
@@ -156,7 +157,12 @@ class FlightJudge:
         self._constrained = bool(problem.constraints)
         self._states = tuple(names[0]) or tuple(f"state {i}" for i in range(n))
         self._inputs = tuple(names[1]) or tuple(f"input {j}" for j in range(m))
-        self._no_input = np.full(m, np.nan)
+        if len(self._states) != n or len(self._inputs) != m:
+            raise ShapeError(
+                f"names must be of {n} states and {m} inputs; "
+                f"got {self._states} and {self._inputs}"
+            )
+        self._unknown_input = np.full(m, np.nan)
         self._no_means = np.full((2, n), np.nan)
         self._no_covariances = np.full((2, n, n), np.nan)
         self.last = Judgement()
@@ -188,7 +194,11 @@ class FlightJudge:
         return cls(problem, noise, names)
 
     def judge(
-        self, measured: Array, reference: Array, decision: Decision | None
+        self,
+        measured: Array,
+        reference: Array,
+        decision: Decision | None,
+        input: Array | None = None,
     ) -> Judgement:
         """Judges one step.
 
@@ -197,6 +207,8 @@ class FlightJudge:
                 measured.
             reference: What it is to be from now on (H + 1, n), or a set point (n,).
             decision: What the controller decided on it; None where it was not called.
+            input: What is applied until the next step (m,); by default that of an
+                applicable decision, and unknown without one.
 
         Raises:
             ShapeError: One of them is of another number of states or inputs.
@@ -205,15 +217,14 @@ class FlightJudge:
         references = _float64(reference)
         if references.ndim == 1:
             references = references[None]
-        input = self._no_input
         means = self._no_means
         covariances = self._no_covariances
         novelty = math.nan
-        violation = 0.0
+        violation = math.nan
         is_applied = decision is not None and decision.applicable
-        if decision is not None:
-            input = decision.input  # a copy of its own, of float64
         if decision is not None and is_applied:
+            if input is None:
+                input = decision.input
             means = _float64(decision.means)
             covariances = _float64(decision.covariances)
             # One that would have to be measured first is not worth the time here.
@@ -221,31 +232,32 @@ class FlightJudge:
                 novelty = float(decision.plan_novelty)
             if self._constrained:
                 violation = float(decision.violation)
-        reason = checks.MISFIT
+        applied_input = self._unknown_input if input is None else _float64(input)
+        code = checks.MISFIT
         has_right_axes = (
             measured.ndim == 1
             and references.ndim == 2
             and means.ndim == 2
             and covariances.ndim == 3
-            and input.ndim == 1
+            and applied_input.ndim == 1
         )
         if has_right_axes:  # else compiled code must not see them
-            reason = checks.judge_step.unchecked(
+            code = checks.judge_step.unchecked(
                 self._settings,
                 self._memory,
                 measured=measured,
                 reference=references,
                 means=means,
                 covariances=covariances,
-                input=input,
+                input=applied_input,
                 is_applied=is_applied,
                 novelty=novelty,
                 violation=violation,
             )
-        if reason == checks.HEALTHY:
+        if code == checks.HEALTHY:
             self.last = _ALL_WELL
-        elif reason == checks.MISFIT:
-            self._refuse_shapes(measured, references, means, covariances, input)
+        elif code == checks.MISFIT:
+            self._refuse_shapes(measured, references, means, covariances, applied_input)
         else:
             self.last = self._alarm_in_words()
         return self.last
@@ -265,7 +277,7 @@ class FlightJudge:
         n = self._no_means.shape[1]
         stages = max(len(means), 2)  # the next state is one of them
         _check_shape("measured", measured.shape, (n,))
-        _check_shape("decision.input", input.shape, self._no_input.shape)
+        _check_shape("input", input.shape, self._unknown_input.shape)
         _check_shape("decision.means", means.shape, (stages, n))
         _check_shape("decision.covariances", covariances.shape, (stages, n, n))
         got = references.shape

@@ -70,7 +70,7 @@ class Command:
     #: reach a plant
     status: Status
     #: of the controller, with this status; None where it was not called or returned
-    #: inputs of another shape
+    #: inputs of another shape. A prediction of another shape is NaN
     decision: Decision | None
     #: the decision that the next step goes on from, not its plan alone: the one that is
     #: applied now, or the last applicable one, shifted to this step. Before any was:
@@ -351,7 +351,7 @@ class ControlLoop:
             measured = measured[:n]
             states = states[..., :n]
             decision = plan_of_first_states(decision, n)
-        return self._judge.judge(measured, states, decision)
+        return self._judge.judge(measured, states, decision, command.input)
 
     def input_between(self, state: Any, share: float) -> np.ndarray:
         """Returns the input to apply until the next decision (m,).
@@ -457,17 +457,20 @@ def _conclude(
     reference = situation.reference
     status = Status.INVALID_MEASUREMENT if decision is None else decision.status
     reason = status.advice
-    if decision is not None and decision.applicable:
-        fits = _has_right_shape(controller, decision, last)
-        plan = _admit(controller, decision, last) if fits else None
-        if plan is not None:
-            return _command(plan, status, decision=plan, situation=situation)
+    readable = _readable(controller, decision, situation, last)
+    plan = None
+    if readable is not None and readable.applicable:
+        plan = _admit(controller, readable, last)
+    if plan is not None:
+        return _command(plan, status, decision=plan, situation=situation)
+    if decision is not None and decision.applicable:  # it is refused
         reason = (
             f"its plan, {status.name}, is not finite or out of its bounds or shape; "
             f"its input: {decision.input}"
         )
         status = Status.NUMERICAL_TROUBLE
-        decision = replace(decision, status=status, suboptimal=False) if fits else None
+        if readable is not None:
+            readable = replace(readable, status=status, suboptimal=False)
     if on_failure == "raise":
         raise SolverFailure(step, reason)
     plan = _plan_of_policy(controller, last, on_failure)
@@ -476,8 +479,8 @@ def _conclude(
     if plan is None:
         rule = "no earlier plan and no reference input to fall back on"
         raise SolverFailure(step, f"{reason} ({rule})")
-    plan = replace(plan, learned=_learned_so_far(decision, last))
-    return _command(plan, status, decision=decision, situation=situation)
+    plan = replace(plan, learned=_learned_so_far(decision, last, plan.input))
+    return _command(plan, status, decision=readable, situation=situation)
 
 
 def _command(
@@ -493,15 +496,26 @@ def _command(
     )
 
 
-def _learned_so_far(decision: Decision | None, last: Command | None) -> Any:
+def _learned_so_far(
+    decision: Decision | None, last: Command | None, input: np.ndarray
+) -> Any:
     """Returns what a flight has taught when a decision is not applied.
 
-    A controller that was called has learned from the step; for one that was not, the
-    step counts as time.
+    A controller that was called has learned up to this step's measurement; it learns
+    the step that begins here by the input that is applied. For one that was not called
+    the step counts as time, and ends in a gap.
+
+    Args:
+        decision: That failed; None where the controller was not called.
+        last: Command of the step before.
+        input: Of the policy (m,).
     """
     if decision is not None and decision.learned is not None:
-        return decision.learned
-    learned: Any = None
+        learned = decision.learned
+        if hasattr(learned, "with_input_of_policy"):
+            return learned.with_input_of_policy(input)
+        return learned
+    learned = None
     if last is not None and last.plan is not None:
         learned = last.plan.learned
     return learned.later() if hasattr(learned, "later") else learned
@@ -561,7 +575,7 @@ def _plan_without_prediction(
     None where neither is known. The plan is not applicable: it predicts nothing.
     """
     known_input = getattr(controller, "initial_input", None)
-    if reference.inputs is not None:
+    if reference.inputs is not None and np.isfinite(reference.inputs[0]).all():
         known_input = reference.inputs[0]
     if known_input is None or not np.isfinite(known_input).all():
         return None
@@ -578,6 +592,31 @@ def _plan_without_prediction(
         status=status,
         iterations=0,
         timing=Timing(),
+    )
+
+
+def _readable(
+    controller: Controller,
+    decision: Decision | None,
+    situation: Situation,
+    last: Command | None,
+) -> Decision | None:
+    """Returns a decision of inputs (H, m), whose prediction is (H + 1, n).
+
+    The prediction is NaN where the controller predicts nothing, or something of another
+    shape. None without such inputs.
+    """
+    if decision is None or not _has_right_shape(controller, decision, last):
+        return None
+    stages = len(decision.inputs) + 1
+    n = situation.belief.mean.shape[-1]
+    has_means = np.shape(decision.means) == (stages, n)
+    if has_means and np.shape(decision.covariances) == (stages, n, n):
+        return decision
+    return replace(
+        decision,
+        means=np.full((stages, n), np.nan),
+        covariances=np.full((stages, n, n), np.nan),
     )
 
 

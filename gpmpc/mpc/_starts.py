@@ -38,11 +38,13 @@ from gpmpc.mpc._controller import (
     Decision,
     Reference,
     check_arguments,
+    one_step_on,
 )
 from gpmpc.mpc._foresight import Foresight, ModelFlight, Trajectory
 from gpmpc.mpc._linear_quadratic import References, evaluate_cost
 from gpmpc.mpc._linearization import StageCosts, StageLinearizer
 from gpmpc.mpc._question import Question
+from gpmpc.mpc._sqp import FAILURES
 from gpmpc.mpc._stage_meter import CostSum, FlownCosts
 from gpmpc.mpc._start_guesses import Starts, kicks, turned
 from gpmpc.mpc.gp_mpc import GPMPC
@@ -88,13 +90,14 @@ class _Pursuit(NamedTuple):
     dearest: float  # of the stages so far, violations left out
     age: int  # decisions since it was found
     costs: FlownCosts  # of the stages of the plan
+    states: Array  # of the plan (H + 1, n)
     flight: (
         ModelFlight | None
     )  # from this decision on; None where the controller took over
     arrives: bool = True  # whether it holds the goal in the end
 
     @classmethod
-    def of_plan(cls, goal: Array, costs: FlownCosts) -> "_Pursuit":
+    def of_plan(cls, goal: Array, costs: FlownCosts, states: Array) -> "_Pursuit":
         """Returns that of the controller's own plan to a set point."""
         return cls(
             goal=goal,
@@ -103,6 +106,7 @@ class _Pursuit(NamedTuple):
             dearest=costs.dearest,
             age=0,
             costs=costs,
+            states=states,
             flight=None,
         )
 
@@ -126,12 +130,13 @@ class _Pursuit(NamedTuple):
             dearest=dearest,
             age=0,
             costs=flight.costs[:horizon],
+            states=flight.states[: horizon + 1],
             flight=flight,
             arrives=flight.arrives,
         )
 
-    def after_decision(self, costs: FlownCosts) -> "_Pursuit":
-        """Returns it after one more decision of the controller, with its plan's costs.
+    def after_decision(self, costs: FlownCosts, states: Array) -> "_Pursuit":
+        """Returns it after one more decision of the controller, with that plan.
 
         What remains of a flight is of no use then: its plans are compared.
         """
@@ -139,6 +144,7 @@ class _Pursuit(NamedTuple):
             dearest=max(self.dearest, costs.dearest),
             age=self.age + 1,
             costs=costs,
+            states=states,
             flight=None,
         )
 
@@ -148,6 +154,7 @@ class _Pursuit(NamedTuple):
             remaining=self.remaining_after_stage,
             age=self.age + 1,
             costs=flight.costs[:horizon],
+            states=flight.states[: horizon + 1],
             flight=flight,
         )
 
@@ -157,27 +164,29 @@ class _Pursuit(NamedTuple):
         return self.remaining.less(self.costs[:1].sum())
 
     def after_failed_steps(self, decision: Decision, horizon: int) -> "_Pursuit":
-        """Returns it with its flight from a decision's step on.
+        """Returns it with its plan and flight from a decision's step on.
 
         A failed step may have left stages behind, which are paid by now. Of a flight
         that is no longer than a horizon a plan of H stages sees as much: it is dropped.
         """
-        if self.flight is None:
-            return self
-        # Means of a plan along a flight are a slice of its states: equal to the digit.
-        is_now = (self.flight.states == decision.means[0]).all(axis=1)
+        # Means of a plan that was shifted are rows of it: equal to the digit.
+        is_now = (self.states == decision.means[0]).all(axis=1)
         stages = np.flatnonzero(is_now)
-        if not len(stages):
-            return self._replace(flight=None)
+        if not len(stages):  # no plan can be compared with what is not known
+            return self._replace(costs=self.costs[:0], flight=None)
         passed_count = int(stages[0])
-        flight = self.flight.after(passed_count)
-        costs = self.costs
-        if passed_count > 0:
+        costs = self.costs[passed_count:]
+        flight = None
+        if self.flight is not None:
+            flight = self.flight.after(passed_count)
             costs = flight.costs[:horizon]
+            if len(flight) <= horizon:
+                flight = None
         return self._replace(
-            remaining=self.remaining.less(self.flight.costs[:passed_count].sum()),
+            remaining=self.remaining.less(self.costs[:passed_count].sum()),
             costs=costs,
-            flight=flight if len(flight) > horizon else None,
+            states=self.states[passed_count:],
+            flight=flight,
         )
 
 
@@ -287,10 +296,12 @@ class ManyStarts:
             its turns; by default its cost, flown on.
         budget: Time after which no further start is taken, once a plan is found [s];
             None for no limit. A search takes a second or several; what ``controller``
-            does by itself is flown first, whatever the budget.
+            does from its last plan, or without one, is flown first, whatever the
+            budget.
 
     Raises:
-        SettingError: A controller of another form, or a number out of range.
+        SettingError: A controller of another form, a planner of another horizon, or a
+            number out of range.
         ShapeError: Guesses of another shape.
 
     >>> from gpmpc.models import KnownModel
@@ -321,9 +332,11 @@ class ManyStarts:
             check_kind(key, one, GPMPC, "GPMPC(...)")
             if one.prediction.settings.is_held:
                 raise SettingError(
-                    "controller",
-                    "must be of form 'trajectory', whose plans may start anywhere",
+                    key, "must be of form 'trajectory', whose plans may start anywhere"
                 )
+        if self.planner.horizon != controller.horizon:
+            rule = f"must have the controller's horizon, {controller.horizon}"
+            raise SettingError("planner", f"{rule}; got {self.planner.horizon}")
         self.problem = controller.problem
         self._angles = controller.prediction.problem.cost.angle_indices
         self.horizon = controller.horizon
@@ -468,9 +481,10 @@ class ManyStarts:
         costs = self._foresight.meter(decision.means, decision.inputs, question)
         if not decision.applicable or self._is_lost(costs, pursuit):
             return None
-        next_pursuit = _Pursuit.of_plan(np.array(situation.end), costs)
+        states = decision.means
+        next_pursuit = _Pursuit.of_plan(np.array(situation.end), costs, states)
         if pursuit is not None:
-            next_pursuit = pursuit.after_decision(costs)
+            next_pursuit = pursuit.after_decision(costs, states)
         return _FollowedDecision.of(decision, next_pursuit)
 
     def _search_anew(
@@ -554,9 +568,11 @@ class ManyStarts:
             return not self._foresight.arrives(costs)
         if self._foresight.arrives(costs, pursuit.dearest):
             return False
-        # Both are of the stages that the last plan saw, too.
+        promised = pursuit.costs[1:]  # of the stages that both plans see
         is_dearer = (
-            costs[:-1].sum().is_dearer(pursuit.costs[1:].sum(), _RISE, pursuit.expected)
+            costs[: len(promised)]
+            .sum()
+            .is_dearer(promised.sum(), _RISE, pursuit.expected)
         )
         return is_dearer or pursuit.age >= self._foresight.longest
 
@@ -639,7 +655,10 @@ class ManyStarts:
                 continue
             different.append(inputs)
             if not self.planner.prediction.settings.rolled_out:
-                gains = self.planner.gains(decision, question.parameters)
+                try:
+                    gains = self.planner.gains(decision, question.parameters)
+                except FAILURES:  # where the model has no slopes
+                    continue
                 states, inputs = foresight.roll_out(
                     states, inputs, gains, state, question
                 )
@@ -679,8 +698,16 @@ class ManyStarts:
             limit = plan_cost(decision.means, decision.inputs) / (1.0 + _DEARER)
         if plan_cost(means, inputs) >= limit:
             return decision
-        gains = self.controller.gains(previous, situation.parameters)
-        gains = np.concatenate([gains[1:], gains[-1:]])
+        shifted = replace(
+            previous,
+            inputs=inputs,
+            means=means,
+            covariances=one_step_on(previous.covariances),
+        )
+        try:
+            gains = self.controller.gains(shifted, situation.parameters)
+        except FAILURES:  # where the model has no slopes
+            return decision
         question = self._question(situation._replace(reference=goal))
         states, inputs = self._foresight.roll_out(
             means, inputs, gains, situation.state, question

@@ -128,7 +128,7 @@ class Flight:
             gp_version=0 if learned is None else learned.version,
             failed=command.failed,
             status=command.status,
-            judgement=self._judge.judge(measured, reference, decision),
+            judgement=self._judge.judge(measured, reference, decision, input),
         )
         if self._on_step is not None:
             self._on_step(step)

@@ -381,6 +381,31 @@ def test_what_a_failed_decision_was_taught_is_not_lost():
         assert learned.model.time == k
 
 
+@pytest.mark.parametrize(("lost", "steps"), [((), 10), ((14, 15), 7)])
+def test_a_flight_teaches_while_its_decisions_fail(lost, steps, monkeypatch):
+    """What was applied and what came of it is known, but around a dropout."""
+    controller = controller_of(OnlineLearning())
+    decide = controller.controller.control
+
+    def fail(*arguments):
+        decision = decide(*arguments)
+        return replace(decision, status=Status.INFEASIBLE, suboptimal=False)
+
+    loop = ControlLoop(controller)
+    random = np.random.default_rng(0)
+    state = SINE[0].copy()
+    sizes = []
+    for k in range(21):
+        if k == 10:
+            monkeypatch.setattr(controller.controller, "control", fail)
+        measured = np.full(2, NAN) if k in lost else state
+        input = loop.input(measured, SINE[k : k + HORIZON + 1])
+        state = cart(state, input) + random.normal(0, NOISE)
+        sizes.append(len(loop.last.plan.learned.model))
+    assert sizes[20] - sizes[10] == steps
+    assert loop.last.plan.learned.model.time == 20.0
+
+
 def test_feedback_between_plans_is_that_of_the_controller():
     inputs = []
     for learning in (None, OnlineLearning()):

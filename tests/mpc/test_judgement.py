@@ -471,3 +471,94 @@ def test_an_input_at_its_bound_from_the_first_unknown_step_is_named():
         plan = plan_of(np.array([1.0, 0.0]))
         judgement = judge.judge(measured, np.zeros(2), replace(plan, input=np.ones(1)))
     assert judgement.reason.startswith("input 0 is at its bound")
+
+
+def judged_at(distances, **by_step):
+    """Judgements of a point at distances from its goal, where its plans keep it.
+
+    A policy applies 1.
+    """
+    judge = FlightJudge(CONTROLLER.problem)
+    judgements = []
+    for k, distance in enumerate(distances):
+        state = np.array([distance, 0.01 * (k % 2)])
+        plan = plan_of(np.array([distance, 0.0]))
+        plan = replace(plan, **{name: values[k] for name, values in by_step.items()})
+        applied = None if plan.applicable else np.ones(1)
+        judgements.append(judge.judge(state, np.zeros(2), plan, applied))
+    return judgements
+
+
+def test_a_step_without_a_plan_is_judged_by_the_horizon_of_the_last():
+    judge = FlightJudge(CONTROLLER.problem)
+    means = np.tile([1.0, 0.0], (51, 1))
+    long_plan = replace(
+        plan_of(np.zeros(2)),
+        inputs=np.zeros((50, 1)),
+        means=means,
+        covariances=np.zeros((51, 2, 2)),
+    )
+    for k in range(152):
+        is_missing = k in (45, 70, 100)
+        plan = None if is_missing else replace(long_plan, input=np.ones(1))
+        measured = np.full(2, np.nan) if is_missing else [1.0, 0.01 * (k % 2)]
+        judgement = judge.judge(np.array(measured), np.zeros(2), plan)
+        if k < 100:
+            assert judgement == Judgement()
+    assert judgement.reason.startswith("no nearer to the reference for 151 steps")
+
+
+@pytest.mark.parametrize("input", [0.0, -1.0], ids=["free", "at its bound"])
+@pytest.mark.parametrize("way", [0.0, 1.0])
+def test_a_push_after_a_long_rest_is_no_long_way(way, input):
+    """What it rests with may be at a bound, as of a brake."""
+    distances = np.concatenate([[way], np.zeros(100), 0.6 * np.ones(70)])
+    inputs = np.full((171, 1), input)
+    reasons = [each.reason for each in judged_at(distances, input=inputs)]
+    assert not any("bound" in reason or "nearer" in reason for reason in reasons[:141])
+    expected = "no nearer to the reference for 61 steps"
+    if input:
+        expected = "input 0 is at its bound for 41 steps"
+        assert reasons[141].startswith(expected)
+    else:
+        assert reasons[162].startswith(expected)
+
+
+def test_an_input_of_the_policy_is_an_input_as_well():
+    """A failed decision has none: what is applied is that of the policy."""
+    failing = [Status.INFEASIBLE if k % 20 == 15 else Status.SOLVED for k in range(50)]
+    judgements = judged_at(np.ones(50), status=failing, input=np.ones((50, 1)))
+    assert judgements[-1].reason.startswith("input 0 is at its bound for 50 steps")
+
+
+@pytest.mark.parametrize(
+    ("violation", "is_missed"), [(5e-6, False), (2e-5, True)], ids=["kept", "missed"]
+)
+def test_a_constraint_that_is_missed_is_so_across_failed_solves(violation, is_missed):
+    wall = Halfspaces([[1.0, 0.0]], [-0.5])
+    judge = FlightJudge(controller(constraints=[wall]).problem)
+    for k in range(40):
+        status = Status.INFEASIBLE if k % 12 == 6 else Status.SOLVED
+        plan = plan_of(np.zeros(2), status=status, violation=violation)
+        judgement = judge.judge(np.array([0.0, 0.01 * (k % 2)]), np.zeros(2), plan)
+    assert ("plans miss a constraint" in judgement.reason) == is_missed
+
+
+def test_a_lost_flight_names_its_last_cost_where_no_plan_is():
+    judge = FlightJudge(CONTROLLER.problem)
+    for k in range(60):
+        distance = 1.2 ** max(0, k - 20)
+        means = np.tile([1.2 * distance, 0.0], (6, 1))
+        means[0] = [distance, 0.0]
+        plan = None if k == 59 else replace(plan_of(np.zeros(2)), means=means)
+        judgement = judge.judge(means[0], np.zeros(2), plan)
+        if k == 58:
+            last = judgement
+    assert "ever more, although the model predicts well" in judgement.reason
+    assert judgement == last
+
+
+def test_names_of_another_number_of_states_are_refused():
+    for names in ((["x"], ["u"]), (["x", "y"], ["u", "v"])):
+        with pytest.raises(ShapeError, match="names must be of 2 states and 1 inputs"):
+            FlightJudge(CONTROLLER.problem, names=names)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -153,3 +155,58 @@ def test_before_a_plan_each_step_applies_its_reference_input(on_failure):
         applied.append(last.input[0])
     assert applied == [100, 101, 102, 30]
     assert last.plan.status.solved
+
+
+class Odd(Planner):
+    """Its failing decisions are of another shape; its predictions, too, if asked."""
+
+    def __init__(self, *failing, inputs=(4, 1), means=(5, 1), status=Status.SOLVED):
+        super().__init__(*failing)
+        self.shapes = (inputs, means)
+        self.status = status
+
+    def control(self, belief, reference, previous=None):
+        k = len(self.previous)
+        decision = super().control(belief, reference, previous)
+        if k not in self.failing:
+            return decision
+        inputs, means = (np.ones(shape) for shape in self.shapes)
+        return replace(
+            decision,
+            input=inputs[0] if len(inputs) else np.empty(0),
+            inputs=inputs,
+            means=means,
+            status=self.status,
+        )
+
+
+@pytest.mark.parametrize(
+    ("change", "status", "input"),
+    [
+        ({"inputs": (0, 1), "status": Status.INFEASIBLE}, Status.INFEASIBLE, 11),
+        ({"inputs": (4, 2), "status": Status.INFEASIBLE}, Status.INFEASIBLE, 11),
+        ({"inputs": (4, 2)}, Status.NUMERICAL_TROUBLE, 11),
+        ({"means": (0, 1)}, Status.SOLVED, 1),
+        ({"means": (1, 1)}, Status.SOLVED, 1),
+        ({"means": (5, 2)}, Status.SOLVED, 1),
+    ],
+)
+def test_a_decision_of_another_shape_costs_no_input(change, status, input):
+    """Inputs that predict nothing are applied; the step after may go on along them."""
+    loop = ControlLoop(Odd(2, **change))
+    for _ in range(3):
+        applied = loop.input(np.zeros(1), np.zeros(1))
+    assert applied.tolist() == [input]
+    assert loop.last.status is status
+    assert (loop.last.decision is None) == ("inputs" in change)
+    goes_on = loop.input([np.nan], np.zeros(1))
+    assert goes_on.tolist() == [12 if input == 11 else 1]
+    assert np.isfinite(loop.input_between([0.0], 0.5)).all()
+
+
+def test_a_reference_input_that_is_not_finite_is_none():
+    planner = Planner()
+    planner.initial_input = np.array([3.0])
+    reference = Reference(np.zeros((5, 1)), np.full((4, 1), np.nan))
+    (command,) = run(planner, 1, "previous_plan", [LOST], reference)
+    assert command.input == pytest.approx([3.0])

@@ -26,6 +26,8 @@ from gpmpc.mpc import (
     Tracking,
     kicks,
 )
+from gpmpc.mpc._stage_meter import FlownCosts
+from gpmpc.mpc._starts import _Pursuit
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from gpmpc.systems import cart_pole, double_pendulum, pendulum, step
@@ -362,11 +364,13 @@ def test_a_plan_that_is_kept_says_that_the_controller_failed():
         Problem(Tracking([1.0, 0.1], [0.05]), Box([-2.0], [2.0])),
         12,
         [0.0],
+        PredictionSettings(disturbance_gain=0.2),
     )
     many = ManyStarts(one)
     loop = ControlLoop(many)
     state = np.array([0.2, 0.0])
     loop.input(state, np.zeros(2))
+    loop.input(loop.last.decision.means[1] + 0.01, np.zeros(2))
     last = loop.last.decision
     one.fails = True
     loop.input(last.means[1], np.zeros(2))
@@ -377,6 +381,8 @@ def test_a_plan_that_is_kept_says_that_the_controller_failed():
     assert decision.solution is None
     assert np.abs(last.covariances).max() > 0.0
     assert np.array_equal(decision.covariances, last.covariances)
+    assert np.abs(last.disturbance).max() > 0.0
+    assert np.array_equal(decision.disturbance, last.disturbance)
 
 
 def test_plans_that_differ_in_a_small_input_are_two():
@@ -690,3 +696,45 @@ def test_the_novelty_of_a_followed_flight_is_that_of_its_own_plan():
     )
     assert callable(measure)
     assert decision.novelty == pytest.approx(measure(), rel=1e-9)
+
+
+@pytest.mark.parametrize("failed_steps", [0, 1, 3])
+def test_after_failed_steps_a_plan_is_compared_stage_by_stage(failed_steps):
+    """The late stages of a swing-up are the dear ones: they were promised."""
+    one = controller(pendulum(), [1.0, 0.01], [0.01], 5)
+    many = ManyStarts(one)
+    stages = np.array([1.0, 1.0, 1.0, 5.0, 9.0, 9.0, 9.0, 9.0, 9.0])
+    states = np.arange(20.0).reshape(10, 2)
+
+    def costs(first):
+        five = stages[first : first + 5]
+        return FlownCosts(five, inputs=np.zeros(5), violations=np.zeros(5))
+
+    pursuit = _Pursuit.of_plan(np.zeros(2), costs(0), states[:6])
+    previous = one.control(Gaussian.certain(states[0]), Reference(np.zeros(2)))
+    previous = replace(previous, means=states[failed_steps : failed_steps + 6])
+    pursuit = pursuit.after_failed_steps(previous, horizon=5)
+    now = failed_steps + 1
+    assert pursuit.costs.total.tolist() == stages[failed_steps:5].tolist()
+    assert not many._is_lost(costs(now), pursuit)
+    dearer = replace(costs(now), errors=1.5 * costs(now).errors)
+    assert many._is_lost(dearer, pursuit)
+
+
+def test_a_planner_that_does_not_fit_is_named():
+    one = controller(pendulum(), [1.0, 0.01], [0.01], 10)
+    held = PredictionSettings(form="velocity", covariance="none")
+    planners = {
+        "of form": GPMPC(
+            one.prediction.model,
+            Linearization(),
+            one.problem,
+            10,
+            [0.0],
+            held,
+        ),
+        "horizon, 10; got 12": controller(pendulum(), [1.0, 0.01], [0.01], 12),
+    }
+    for rule, planner in planners.items():
+        with pytest.raises(SettingError, match=f"^planner: .*{rule}"):
+            ManyStarts(one, planner, guesses=[None])
