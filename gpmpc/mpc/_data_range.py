@@ -11,7 +11,7 @@ import numpy as np
 from gpmpc._angles import TURN, arc
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, to_array
-from gpmpc.exceptions import ShapeError
+from gpmpc.exceptions import DataError, ShapeError
 from gpmpc.gp import GPPosterior
 from gpmpc.models import LogDynamics, RigidBodyKinematics
 from gpmpc.models._past import measured_dim, measured_signals
@@ -76,6 +76,10 @@ def beyond_data(model: DynamicsModel, reference: Any) -> list[BeyondData]:
         reference: A set point (n,), or states of any number of steps (K, n), as for a
             controller.
 
+    Raises:
+        ShapeError: A reference of another number of states.
+        DataError: One that is not finite.
+
     See Also:
         ``BeyondData``; ``gpmpc.datasets.RandomData`` for data that reach
         farther.
@@ -94,6 +98,8 @@ def beyond_data(model: DynamicsModel, reference: Any) -> list[BeyondData]:
         raise ShapeError(
             f"reference must have {sizes[0]} states; got {states.shape[-1]}"
         )
+    if not np.isfinite(states).all():
+        raise DataError("reference states must be finite")
     beyond = []
     for column in columns:
         values = states[:, column.state]

@@ -24,6 +24,7 @@ _LOWEST_GAIN = 0.5  # of the plant's inputs, in the model's
 _HIGHEST_GAIN = 1.5
 _GAINS = 21  # gains that are tried from the lowest to the highest
 _GAIN_TOLERANCE = 1e-3
+_REST_STEPS = 20  # of Newton's method, towards rest of states of the plant alone
 
 
 class _Plant(NamedTuple):
@@ -64,8 +65,7 @@ class LinearLoop:
         self.horizon = prediction.horizon
         self._disturbance_gain = observer_gain(prediction.settings)
         self._model: Any = plant or ahead or prediction.model
-        learned = bool(to_array(self._model.noise_covariance).any())
-        self._tolerance = _LEARNED if learned else _ROUNDING
+        self._tolerance = _LEARNED if _has_noise(self._model) else _ROUNDING
         self._plant = _linear_plant(prediction, point, plant, ahead)
         self._laws = _laws(point.A, point.B, point.cost, prediction.horizon)
 
@@ -198,6 +198,18 @@ class LinearLoop:
         return loop if L > 0 else loop[: p + m, : p + m]
 
 
+def _has_noise(model: Any) -> bool:
+    """Tells whether a model, or one that it is around, has noise: it was learned.
+
+    What is around may count that noise among its predictions.
+    """
+    noise = getattr(model, "noise_covariance", None)
+    if noise is not None and to_array(noise).any():
+        return True
+    within = getattr(model, "model", None)
+    return within is not None and _has_noise(within)
+
+
 class _Law(NamedTuple):
     """Derivatives of the first inputs u_0 of a horizon (m, ...)."""
 
@@ -299,6 +311,9 @@ def _linear_plant(
     state = np.zeros(p)
     state[own] = point.state[observed]
     state[queue] = np.tile(point.input, len(queue) // m)
+    further = [i for i in range(p) if i not in own and i not in queue]
+    if further:
+        state = _with_rest(plant, state, point.input, further)
     local = linearize(plant, state[None], point.input[None], covariance=False)
     size = p + count * m
     A = np.zeros((size, size))
@@ -316,6 +331,28 @@ def _linear_plant(
     C[observed] = own_rows
     C[pending] = last_inputs[len(last_inputs) - len(pending) :]
     return _Plant(A=A, B=B, is_moved=np.arange(size) < p, C=C, state=state)
+
+
+def _with_rest(
+    plant: DynamicsModel, state: Array, input: Array, further: list[int]
+) -> Array:
+    """Returns a state (p,) whose further entries rest while the others are held.
+
+    They begin at zero; those that no rest is found for stay where Newton's method left
+    them.
+    """
+    state = state.copy()
+    for _ in range(_REST_STEPS):
+        local = linearize(plant, state[None], input[None], covariance=False)
+        defect = (local.mean[0] - state)[further]
+        slopes = np.eye(len(further)) - local.A[0][np.ix_(further, further)]
+        step = np.linalg.lstsq(slopes, defect, rcond=None)[0]
+        if not np.isfinite(step).all():
+            break
+        state[further] += step
+        if np.abs(step).max() <= _ROUNDING * np.abs(state[further]).max():
+            break
+    return state
 
 
 def _look_ahead(

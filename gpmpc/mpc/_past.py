@@ -58,7 +58,9 @@ class Situation:
         weighed = n if problem is None else problem.state_dim
         if belief.mean.shape[-1] != n or weighed != n:
             return cls(belief, reference)
-        belief = belief.in_order(signals_of(controller).state_names)
+        signals = signals_of(controller)
+        belief = belief.in_order(signals.state_names)
+        reference = reference.in_order(signals)
         measured = to_array(belief.mean)
         if last_input is None:
             last_input = np.asarray(controller.initial_input, dtype=float)

@@ -251,7 +251,8 @@ class ControlLoop:
     Args:
         controller: With a problem and an initial input.
         on_failure: ``"previous_plan"`` goes on along the last plan, ``"hold"`` keeps
-            the last input, ``"raise"`` stops.
+            the last input, ``"raise"`` stops: what is applied then is not known here,
+            and another flight takes a loop of its own.
 
     Attributes:
         last: Command of the last step: its input, decision and status; None before the
@@ -515,7 +516,7 @@ def _learned_so_far(
         if hasattr(learned, "with_input_of_policy"):
             return learned.with_input_of_policy(input)
         return learned
-    learned = None
+    learned: Any = None
     if last is not None and last.plan is not None:
         learned = last.plan.learned
     return learned.later() if hasattr(learned, "later") else learned

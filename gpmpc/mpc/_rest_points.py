@@ -180,13 +180,15 @@ class _RestSearch:
         """Returns sizes (n + m,) that states and inputs near zero have all the same.
 
         They are 1, or what is less of their ranges: of a state in the model's data, or
-        as far as the inputs move it within a horizon; of an input between its bounds.
+        as far as the inputs move it within a horizon, or it a state that they move; of
+        an input between its bounds.
         """
         prediction = self._prediction
         lower, upper = prediction.problem.inputs.first
         input_ranges = upper - lower
         if np.isfinite(input_ranges).all():
-            state_ranges = _reach(start.A, start.B, input_ranges, prediction.horizon)
+            reach = _reach(start.A, start.B, input_ranges, prediction.horizon)
+            state_ranges = _ranges_by_effect(start.A, reach, prediction.horizon)
         else:
             state_ranges = np.ones(len(start.A))
         scales = data_scales(prediction.model)
@@ -250,6 +252,27 @@ def _reach(A: Array, B: Array, input_ranges: Array, horizon: int) -> Array:
         effect = A @ effect
         reach = np.minimum(1.0, reach + np.abs(effect) @ input_ranges)
     return reach
+
+
+def _ranges_by_effect(A: Array, reach: Array, horizon: int) -> Array:
+    """Returns the ranges of states (n,), also of those that no input reaches.
+
+    Such a one is as large as it takes to move one that an input reaches by its range
+    within a horizon, 1 at most; 0 where it moves none.
+    """
+    is_reached = reach > 0.0
+    if is_reached.all():
+        return reach
+    power = A
+    effects = np.abs(A)  # largest ones so far
+    for _ in range(horizon - 1):
+        power = A @ power
+        effects = np.maximum(effects, np.abs(power))
+    with np.errstate(divide="ignore"):
+        sizes = reach[is_reached, None] / effects[is_reached]
+    least = sizes.min(axis=0, initial=np.inf)
+    own_ranges = np.where(np.isfinite(least), np.minimum(1.0, least), 0.0)
+    return np.where(is_reached, reach, own_ranges)
 
 
 def _cost_at(

@@ -17,7 +17,7 @@ from scipy.linalg import solve_triangular
 
 from gpmpc._dynamics import to_array
 from gpmpc.gp import GPPosterior
-from gpmpc.models import ResidualModel
+from gpmpc.models import NoisyModel, ResidualModel
 from gpmpc.models._wrapper import LinearWrapper
 
 Array = np.ndarray
@@ -27,11 +27,13 @@ def slope_covariances(model: Any, state: Array, input: Array) -> Array:
     """Returns covariances (n, n + m, n + m) of each next state's derivatives.
 
     They are derivatives by state and input, and covariances by the GPs' own
-    uncertainty: zero for models without a ``GPPosterior``, and for those whose residual
-    acts through a function of the state.
+    uncertainty, as far as it is known here. They are zero for models without a
+    ``GPPosterior``, for residuals that act through a function of the state, and for
+    models of logs and those that change in flight.
 
     Args:
-        model: Learned or known; delays and disturbances around it are looked through.
+        model: Learned or known; delays, disturbances and varying noise around it are
+            looked through.
         state: Where the slopes are taken (n,).
         input: Where the slopes are taken (m,).
     """
@@ -39,6 +41,8 @@ def slope_covariances(model: Any, state: Array, input: Array) -> Array:
         return _gp_covariances(model, np.concatenate([state, input]))
     if isinstance(model, LinearWrapper):
         return _wrapper_covariances(model, state, input)
+    if isinstance(model, NoisyModel):
+        return slope_covariances(model.model, state, input)
     gp: Any = getattr(model, "residual", None)
     if isinstance(gp, GPPosterior) and not callable(model.B):
         return _residual_covariances(model, to_array(model.B), state, input)

@@ -62,7 +62,8 @@ class Stability:
     spectral_radius: float
     #: whether no mode grows: integrators that nothing weighs may stand still. Of a
     #: learned model growth counts above 0.1 % a step, since its integrators are not
-    #: exact ones, and above two standard deviations of what its GPs know
+    #: exact ones, and above two standard deviations of what its GPs know; that of
+    #: models of logs and of kernels of one's own is not known, and counts as zero.
     #: False where no point could be judged
     stable: bool
     #: the shortest horizon from which on no mode grows; None without any of those tried
@@ -200,7 +201,7 @@ def _check(
     own = model.state_dim - len(pending_inputs(model))
     states = plant.state_dim - len(pending_inputs(plant))
     if states < own or plant.input_dim != model.input_dim:
-        rule = f"must have {own} states and {model.input_dim} inputs"
+        rule = f"must have at least {own} states and {model.input_dim} inputs"
         raise SettingError("plant", f"{rule}; got {states} and {plant.input_dim}")
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from gpmpc.exceptions import DataError
 from gpmpc.gp import GPPosterior, Trainer, Transitions
 from gpmpc.models import Affine, DelayedModel, KnownModel, ResidualModel
 from gpmpc.mpc import Reference, beyond_data
@@ -91,3 +92,8 @@ def test_angles_compare_by_their_arc_and_no_data_give_no_range():
     assert upright.name == "x1"
     known = KnownModel(Affine.identity(2, 1), 2, 1)
     assert beyond_data(known, [100.0, 0.0]) == []
+
+
+def test_a_reference_that_is_not_finite_is_refused(model):
+    with pytest.raises(DataError, match="reference states must be finite"):
+        beyond_data(model, [np.nan, 0.0, 0.0])

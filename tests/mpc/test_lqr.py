@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.exceptions import SettingError, ShapeError
+from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import linearize_by_autograd
 from gpmpc.mpc import Box, NonlinearGPMPC, Problem, Reference, Tracking, dlqr
@@ -230,6 +230,19 @@ def test_a_non_finite_or_exploding_model_is_numerical_trouble(factor):
     )
     assert decision.status is Status.NUMERICAL_TROUBLE
     assert np.array_equal(decision.inputs, np.full((4, 1), 0.2))
+
+
+def test_a_model_that_raises_is_numerical_trouble():
+    class Raising(Watched):
+        def linearize(self, states, inputs, covariance=True):
+            raise DataError("no data out there")
+
+    model = Raising(A.tolist(), B.tolist())
+    controller = LQR(model, Problem(Tracking(Q, R, penalized="inputs")), 4, [0.2])
+    decision = controller.control(
+        Gaussian.certain(np.ones(2)), Reference(np.zeros((5, 2)))
+    )
+    assert decision.status is Status.NUMERICAL_TROUBLE
 
 
 def test_a_state_that_requires_gradients_is_like_any_other():

@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 
@@ -252,6 +254,21 @@ def test_a_bad_measurement_is_reported_and_the_plan_shifted():
     )
     assert decision.status is Status.INVALID_MEASUREMENT
     assert np.array_equal(decision.inputs, good.inputs[[1, 2, 2]])
+
+
+def test_a_plant_without_numbers_is_numerical_trouble(monkeypatch):
+    plant = System(DoubleIntegrator(), time_step=0.5, substeps=1)
+    problem = Problem(Tracking([1.0, 0.1], [0.1], penalized="inputs"))
+    controller = NMPC(plant, problem, 3, [0.0])
+
+    def successor(self, state, input):
+        return math.exp(1e4)
+
+    monkeypatch.setattr(System, "successor", successor)
+    decision = controller.control(
+        Gaussian.certain(np.array([1.0, 0.0])), Reference(np.zeros((4, 2)))
+    )
+    assert decision.status is Status.NUMERICAL_TROUBLE
 
 
 def test_reference_inputs_of_another_number_are_refused():

@@ -1,12 +1,20 @@
 """What a GP knows of its own slopes, and what a loop makes of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from gpmpc.gp import GPPosterior, Trainer, Transitions, standardize, train
+from gpmpc.gp import (
+    GPPosterior,
+    Trainer,
+    Transitions,
+    standardize,
+    train,
+)
 from gpmpc.gp._kernel import kernel_matrix
-from gpmpc.models import Affine, DelayedModel, KnownModel, ResidualModel
+from gpmpc.models import Affine, DelayedModel, KnownModel, NoisyModel, ResidualModel
 from gpmpc.mpc import GPMPC, Box, Problem, Tracking
 from gpmpc.mpc._slopes import slope_covariances
 from gpmpc.propagation import Linearization
@@ -64,6 +72,9 @@ def test_models_around_a_gp_are_looked_through(gp):
     assert covariances[:2, :3, :3] == pytest.approx(slope_covariances(gp, STATE, INPUT))
     assert not covariances[2].any()
     assert not covariances[:, 3].any()
+    log_noise = replace(gp, predicts="value")
+    noisy = slope_covariances(NoisyModel(gp, log_noise, [0, 1]), STATE, INPUT)
+    assert noisy == pytest.approx(slope_covariances(gp, STATE, INPUT))
     nominal = KnownModel(Affine.identity(2, 1), 2, 1)
     assert not slope_covariances(nominal, STATE, INPUT).any()
 

@@ -275,6 +275,29 @@ def test_a_mode_that_no_horizon_holds_is_said_to_be_one():
     )
 
 
+def test_a_state_that_no_input_reaches_rests_where_it_fades():
+    fading = linear([[0.9, 0.1], [0.0, 0.5]], [[1.0], [0.0]])
+    cost = Tracking([1.0, 0.1], [0.1])
+    bounded = loop_of(fading, cost, 10, [0.0], bounds=Box([-2.0], [2.0]))
+    assert bounded.stability([1.0, 0.0]).judged
+
+
+def test_a_plants_further_states_are_judged_where_they_rest():
+    """An actuator that stands at 9.81; its gain grows with it."""
+
+    def next_state(x, u):
+        position, actuator = x.unbind(-1)
+        actuator = actuator + 0.5 * (9.81 - actuator)
+        pushed = position + 0.1 * actuator * u[..., 0]
+        return torch.stack([pushed, actuator], dim=-1)
+
+    alone = linear([[1.0]], [[0.981]])
+    controller = loop_of(alone, Tracking([1.0], [0.1]), 10, [0.0])
+    at_rest = controller.stability([0.0], plant=KnownModel(next_state, 2, 1))
+    expected = controller.stability([0.0]).spectral_radius
+    assert at_rest.spectral_radius == pytest.approx(max(0.5, expected))
+
+
 def test_a_reference_at_which_nothing_can_rest_is_not_judged():
     stable = linear([[0.5]], [[1.0]])
     bounded = loop_of(stable, Tracking([1.0], [0.1]), 5, [0.0], bounds=Box([-1], [1]))

@@ -5,9 +5,11 @@ from itertools import product
 
 import numpy as np
 import pytest
+import torch
 
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
+from gpmpc.models import Affine, KnownModel
 from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
 from gpmpc.mpc.baselines import StateFormMPC
 from gpmpc.propagation import Linearization, MeanEquivalence
@@ -128,6 +130,28 @@ def test_what_cannot_be_solved_is_reported():
         controller.control(Gaussian.certain(np.full(6, np.nan)), REFERENCE).status
         is Status.INVALID_MEASUREMENT
     )
+
+
+def test_a_bound_without_a_number_is_numerical_trouble():
+    """A chance constraint whose covariance overflows is no bound of zero."""
+    unstable = Affine(
+        torch.diag(torch.tensor([1.0, 1e60], dtype=torch.float64)),
+        torch.tensor([[1.0], [0.0]], dtype=torch.float64),
+        torch.zeros(2, dtype=torch.float64),
+    )
+    controller = StateFormMPC(
+        KnownModel(unstable, 2, 1),
+        Linearization(),
+        Problem(
+            Tracking([1.0, 0.0], [1.0]),
+            constraints=[Box(None, [np.inf, 1.0], probability=0.9)],
+        ),
+        horizon=6,
+        initial_input=[0.0],
+    )
+    belief = Gaussian(torch.zeros(2).double(), torch.eye(2).double())
+    decision = controller.control(belief, Reference(np.zeros((7, 2))))
+    assert decision.status is Status.NUMERICAL_TROUBLE
 
 
 def test_importing_the_controllers_does_not_load_cvxpy():

@@ -25,6 +25,7 @@ from gpmpc.mpc._controller import (
 from gpmpc.mpc._linear_quadratic import Stages
 from gpmpc.mpc._linearization import StageCosts, StageLinearizer
 from gpmpc.mpc._riccati import optimal_feedback
+from gpmpc.mpc._sqp import FAILURES
 from gpmpc.mpc.problem import Problem
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
@@ -107,7 +108,10 @@ class LQR:
         if reference.inputs is not None:
             inputs = references.inputs
         no_covariances = np.empty((0, *request.covariance.shape))
-        stages = self._linearize(states, inputs, no_covariances)
+        try:
+            stages = self._linearize(states, inputs, no_covariances)
+        except FAILURES:  # where the model has no numbers
+            return request.failed_decision(Status.NUMERICAL_TROUBLE)
         linearized = perf_counter()
         feedback, _ = optimal_feedback(self._cost, stages, references)
         if not np.isfinite(feedback).all():

@@ -36,6 +36,7 @@ from gpmpc.mpc._controller import (
     check_controller,
 )
 from gpmpc.mpc._linear_quadratic import Plan
+from gpmpc.mpc._sqp import FAILURES
 from gpmpc.mpc.problem import Problem
 from gpmpc.signals import signals_of
 from gpmpc.status import Status
@@ -117,8 +118,12 @@ class NMPC:
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)
         parameters = _parameters(request)
+        try:
+            guess = self._guess(request)
+        except (*FAILURES, ArithmeticError):  # where the plant has no numbers
+            return request.failed_decision(Status.NUMERICAL_TROUBLE)
         with interrupts_after():
-            solution = self._program.solve(self._guess(request), parameters)
+            solution = self._program.solve(guess, parameters)
         unknowns = solution.unknowns
         means = np.vstack([request.state, unknowns[: H * n].reshape(H, n)])
         inputs = unknowns[H * n : H * (n + m)].reshape(H, m)

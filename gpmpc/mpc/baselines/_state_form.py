@@ -157,12 +157,16 @@ class StateFormMPC:
         """Returns the prediction along the first guess.
 
         Raises:
-            DataError: It is not finite.
+            DataError: It is not finite, or a bound that applies is not.
         """
         guess = initial_guess(self.prediction, request)
         prediction = self.prediction.linearize(guess, request)
         if not all(np.isfinite(part).all() for part in prediction.stages):
             raise DataError("the stages are not finite")
+        if not self._program.has_finite_bounds(prediction):
+            raise DataError(
+                "bounds, less what covariances take of them, are not finite"
+            )
         return prediction
 
 
@@ -319,7 +323,16 @@ class _StateFormProgram:
         for parameter, value in zip(self._row_values, E, strict=True):
             parameter.value = signs[:, None] * value
         bounds = np.where(signs > 0, rows.upper, -rows.lower)
+        # Those that do not apply are in no constraint.
         self._row_bounds.value = np.where(np.isfinite(bounds), bounds, 0.0)
+
+    def has_finite_bounds(self, prediction: LocalProblem) -> bool:
+        """Tells whether all rows that apply have finite bounds."""
+        if not self._row_values:
+            return True
+        rows = prediction.rows
+        bounds = np.where(self._rows.signs > 0, rows.upper, -rows.lower)
+        return bool(np.isfinite(bounds[self._rows.applies]).all())
 
     def solve(self, solver: str, options: dict) -> Status:
         """Solves it; returns how that ended."""
