@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gpmpc._calls import check_call
 from gpmpc.exceptions import GpmpcError, SettingError
+from gpmpc.gaussian import constant_arrays
 
 _LOST = (TypeError, ValueError, RuntimeError, AttributeError, NotImplementedError)
 _OURS = ("gpmpc", "torch", "numpy", "casadi")  # packages whose frames no user wrote
@@ -70,8 +71,8 @@ def call(key: str, function: Callable[..., Any], *arguments: Tensor) -> Any:
 
     Raises:
         SettingError: It failed where it calls numpy or math, or takes numbers out of a
-            tensor; or its value is one that torch did not follow. Any other error of
-            its own is left as it is.
+            tensor; or torch did not follow its value, or a model's mean or covariance.
+            Any other error of its own is left as it is.
     """
     if not callable(function):
         got = type(function).__name__
@@ -87,8 +88,8 @@ def call(key: str, function: Callable[..., Any], *arguments: Tensor) -> Any:
         if advice is None:
             raise
         raise SettingError(key, f"{_RULE}: {advice}, {_OTHERWISE}") from error
-    if torch.is_grad_enabled() and isinstance(value, Tensor):
-        _check_followed(key, value, arguments)
+    if torch.is_grad_enabled():
+        _check_followed(key, function, value, arguments)
     return value
 
 
@@ -129,19 +130,54 @@ def dynamics_advice(error: BaseException, packages: Sequence[str]) -> str | None
     return f"{DYNAMICS_RULE}: {', '.join(names)}"
 
 
-def _check_followed(key: str, value: Tensor, arguments: tuple[Tensor, ...]) -> None:
-    """Raises ``SettingError`` where values (K, ...) change and torch lost them.
+def _check_followed(
+    key: str, function: Callable[..., Any], value: Any, arguments: tuple[Tensor, ...]
+) -> None:
+    """Raises ``SettingError`` where a value changes with arguments and torch lost it.
 
-    Their derivatives would be taken for zero. One row says nothing, nor does a value
-    that depends on further arguments.
+    Its derivatives would be taken for zero. A value that torch did not follow may be a
+    constant, or one of further arguments: a step away from those that torch follows
+    tells.
     """
-    if value.requires_grad or not all(one.requires_grad for one in arguments):
+    if not any(argument.requires_grad for argument in arguments):
         return
-    if not value.dim() or bool((value == value[:1]).all() | value.isnan().any()):
+    unfollowed = {
+        name: part
+        for name, part in _tensors_in(value).items()
+        if not part.requires_grad
+    }
+    # what a function transform follows has no numbers to be compared
+    if constant_arrays(*(part.cpu() for part in unfollowed.values())) is None:
         return
-    lost = "its values change, and their derivatives are lost"
-    ways = "by numpy, math, torch.tensor, .detach() or .item()"
-    raise SettingError(key, f"{_RULE}: {lost} ({ways}), {_OTHERWISE}")
+    if "covariance" in unfollowed and not unfollowed["covariance"].any():
+        del unfollowed["covariance"]  # a known model has none
+    if not unfollowed:
+        return
+    with torch.no_grad():
+        moved = _tensors_in(function(*[_step_away(one) for one in arguments]))
+    for name, part in unfollowed.items():
+        is_number = part.isfinite() & moved[name].isfinite()
+        if bool((is_number & (part != moved[name])).any()):
+            lost = "its values change, and their derivatives are lost"
+            ways = "by numpy, math, torch.tensor, .detach() or .item()"
+            raise SettingError(key, f"{_RULE}: {lost} ({ways}), {_OTHERWISE}")
+
+
+def _tensors_in(value: Any) -> dict[str, Tensor]:
+    """Returns a tensor, or mean and covariance of a belief, by their names."""
+    if isinstance(value, Tensor):
+        return {"value": value}
+    parts = {name: getattr(value, name, None) for name in ("mean", "covariance")}
+    return {name: part for name, part in parts.items() if isinstance(part, Tensor)}
+
+
+def _step_away(argument: Tensor) -> Tensor:
+    """Returns numbers nearby of an argument that torch follows; another one stays."""
+    if not argument.requires_grad:
+        return argument
+    numbers = argument.detach()
+    width = torch.finfo(numbers.dtype).eps ** (1 / 3)
+    return numbers + width * (1 + numbers.abs())
 
 
 def _advice(function: Any, error: BaseException) -> str | None:

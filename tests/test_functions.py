@@ -85,14 +85,21 @@ def test_constraints_and_outputs_get_the_rule_and_the_name(written, horizon):
         decide(horizon, outputs=[LeastSquares(function, [1.0])])
 
 
+@pytest.mark.parametrize("horizon", [1, 3])
 @pytest.mark.parametrize("written", LOST)
-def test_a_function_that_loses_its_derivative_is_refused(written):
+def test_a_function_that_loses_its_derivative_is_refused(written, horizon):
+    function = LOST[written]
+    parameters = np.zeros((horizon, 1))
     for parts in (
-        {"constraints": [Inequality(LOST[written])]},
-        {"outputs": [LeastSquares(LOST[written], [1.0])]},
+        {"constraints": [Inequality(function)]},
+        {"outputs": [LeastSquares(function, [1.0])]},
+        {
+            "constraints": [Inequality(lambda x, u, p: function(x))],
+            "parameters": parameters,
+        },
     ):
         with pytest.raises(SettingError, match="and their derivatives are lost"):
-            decide(**parts)
+            decide(horizon, **parts)
 
 
 @pytest.mark.parametrize("horizon", [1, 3])

@@ -25,7 +25,8 @@ class CasadiFunction:
     Its operations are read once and run by compiled loops (``gpmpc._kernels.tape``), or
     by CasADi where it calls what is no expression. It serves as nominal model, (state
     (n,), input (m,)) to the next state (n,), and as effect B(x), state (n,) to (n, k).
-    It is evaluated in double precision on the CPU, and torch cannot differentiate it.
+    It is evaluated in double precision on the CPU. Derivatives are CasADi's, those that
+    torch asks for too, of any order.
 
     Raises:
         UnsupportedModel: It is no CasADi function, or has no argument, or more than one
@@ -68,6 +69,21 @@ class CasadiFunction:
         jacobians = [f"jac:{value}:{argument}" for argument in arguments]
         return self.function.factory("expansion", arguments, [value, *jacobians])
 
+    @cached_property
+    def jacobian(self) -> "CasadiFunction":
+        """Derivatives of the value, column by column, by all arguments side by side."""
+        import casadi
+
+        is_tape = self.function.is_a("SXFunction")
+        arguments = self.function.sx_in() if is_tape else self.function.mx_in()
+        value = casadi.vec(self.function(*arguments))
+        parts = [casadi.jacobian(value, argument) for argument in arguments]
+        return CasadiFunction(
+            casadi.Function(
+                f"{self.function.name()}_jacobian", arguments, [casadi.horzcat(*parts)]
+            )
+        )
+
     def check_sizes(self, arguments: tuple[int, ...], value: tuple[int, int]) -> None:
         """Raises ``UnsupportedModel`` unless arguments and value have these sizes."""
         if (tuple(self.sizes), self.shape) != (arguments, value):
@@ -97,6 +113,10 @@ class CasadiFunction:
             ShapeError: They have other sizes than the function's arguments.
         """
         self._check_widths(arguments)
+        return _Evaluation.apply(self, *arguments)
+
+    def evaluate(self, *arguments: Tensor) -> Tensor:
+        """Computes what a call does, as numbers that torch does not follow."""
         like = arguments[0]
         count = like.shape[:-1].numel()
         points = [
@@ -201,3 +221,35 @@ class CasadiFunction:
             jacobian.reshape(size, K, -1).swapaxes(0, 1) for jacobian in jacobians
         ]
         return [values, *by_arguments]
+
+
+class _Evaluation(torch.autograd.Function):
+    """A call of a ``CasadiFunction``, whose derivatives are those of CasADi."""
+
+    @staticmethod
+    def forward(function: CasadiFunction, *arguments: Tensor) -> Tensor:
+        """Computes the value (*batch, rows), or (*batch, rows, columns)."""
+        return function.evaluate(*arguments)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        """Keeps what derivatives are taken of."""
+        ctx.function, *arguments = inputs
+        ctx.save_for_backward(*arguments)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        """Multiplies the value's gradient by the Jacobian, which has derivatives too.
+
+        A value that torch differentiates again is a call of another function.
+        """
+        function = ctx.function
+        arguments = ctx.saved_tensors
+        batch = arguments[0].shape[:-1]
+        rows, columns = function.shape
+        jacobian = function.jacobian(*arguments)
+        jacobian = jacobian.reshape(*batch, rows * columns, sum(function.sizes))
+        if columns > 1:  # the Jacobian's rows go column by column
+            gradient = gradient.mT.flatten(-2)
+        product = (gradient[..., None, :] @ jacobian)[..., 0, :]
+        return None, *product.split(function.sizes, dim=-1)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import predict_with_jacobian
+from gpmpc._functions import call
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp._backend import host_arrays
 from gpmpc.gp._posterior import AffineForm
@@ -173,7 +174,7 @@ class MeanEquivalence(NoisyPropagator):
         return propagation, replace(sensitivity, covariance_by_covariance=zeros)
 
     def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
-        prediction = model.predict(belief.mean, input)
+        prediction = call("model", model.predict, belief.mean, input)
         covariance = prediction.covariance
         return NextMoments(
             mean=prediction.mean,

@@ -31,6 +31,7 @@ from torch import Tensor
 
 from gpmpc._angles import TURN, angles_of, whole_turns
 from gpmpc._calls import explains_arguments
+from gpmpc._functions import call
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.gaussian import (
     Gaussian,
@@ -222,7 +223,7 @@ class Unscented(NoisyPropagator):
 
     def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
         points = self._sigma_points(belief, square_root(belief.covariance), input)
-        predictions = model.predict(points.states, points.inputs)
+        predictions = call("model", model.predict, points.states, points.inputs)
         return self._moments(model, belief, points.steps, predictions)
 
     def _moments(
@@ -314,7 +315,7 @@ class MonteCarlo(NoisyPropagator):
         beliefs = steps.shape[:-2].numel()
         for chunk in steps.split(max(_CHUNK // max(beliefs, 1), 1), dim=-2):
             states = belief.mean[..., None, :] + chunk
-            predictions = model.predict(states, _repeated(input, states))
+            predictions = call("model", model.predict, states, _repeated(input, states))
             means.append(predictions.mean)
             covariances = covariances + predictions.covariance.sum(-3)
         values = torch.cat(means, dim=-2)

@@ -1,6 +1,7 @@
 """Closed-form derivatives against torch autograd through the torch evaluation, for
 every model that has them."""
 
+import casadi
 import pytest
 import torch
 
@@ -8,11 +9,12 @@ from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend, remove_points
-from gpmpc.models import Affine, DelayedModel, ResidualModel
+from gpmpc.models import Affine, CasadiFunction, DelayedModel, ResidualModel
 from gpmpc.propagation import (
     Linearization,
     MeanEquivalence,
     MomentMatching,
+    MonteCarlo,
     Unscented,
     differentiate,
     linearize,
@@ -102,6 +104,61 @@ def test_closed_forms_are_autograds_derivatives(propagator, name, batch, choice)
             rtol=1e-9,
             atol=1e-10 * max(1.0, float(other.abs().max()) if other.numel() else 1),
         )
+
+
+class ModelWithoutGradients:
+    """Predicts by numbers alone, as a model of NumPy does."""
+
+    state_dim = output_dim = 2
+    input_dim = 1
+    dtype = torch.float64
+    device = torch.device("cpu")
+    noise_covariance = torch.zeros(2, 2)
+
+    def predict(self, state, input):
+        mean = 0.9 * state.detach()
+        return Gaussian(mean, torch.diag_embed(0.1 + mean**2))
+
+
+@pytest.mark.parametrize("batch", [(), (1,), (3,)], ids=str)
+@pytest.mark.parametrize(
+    "propagator",
+    [MeanEquivalence(), Linearization(), Unscented(), MonteCarlo(20)],
+    ids=_name,
+)
+def test_functions_in_casadi_have_derivatives_and_lost_ones_are_refused(
+    propagator, batch
+):
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u")
+    next_state = casadi.vertcat(casadi.sin(x[0]) * u, x[0] * x[1] + 1.0)
+    effect = casadi.vertcat(x[1] ** 2, x[0])
+    gp = value_model(2, 1, 1)
+    in_casadi, in_torch = (
+        ResidualModel(nominal, gp, B, [0, 1], [0], input_dim=1, noise=torch.zeros(2, 2))
+        for nominal, B in (
+            (
+                CasadiFunction(casadi.Function("f", [x, u], [next_state])),
+                CasadiFunction(casadi.Function("b", [x], [effect])),
+            ),
+            (
+                lambda x, u: torch.stack(
+                    [x[..., 0].sin() * u[..., 0], x[..., 0] * x[..., 1] + 1.0], dim=-1
+                ),
+                lambda x: torch.stack([x[..., 1] ** 2, x[..., 0]], dim=-1),
+            ),
+        )
+    )
+    at = Gaussian(draw(*batch, 2), 0.1 * torch.eye(2).expand(*batch, 2, 2))
+    control = draw(*batch, 1)
+    propagation, mine = differentiate(propagator, in_casadi, at, control)
+    _, expected = differentiate(propagator, in_torch, at, control)
+    for part, value in vars(expected).items():
+        assert torch.allclose(getattr(mine, part), value, rtol=1e-9, atol=1e-12)
+    direct = propagator(in_casadi, at, control).covariance
+    assert torch.allclose(propagation.belief.covariance, direct, atol=1e-12)
+    with pytest.raises(SettingError, match="model: .* derivatives are lost"):
+        differentiate(propagator, ModelWithoutGradients(), at, control)
 
 
 @pytest.mark.parametrize(
