@@ -319,9 +319,9 @@ def is_in_graph(model: Any) -> bool:
     They are those of GPs, of an affine nominal model and of an effect B, its own or
     those of the model that it is made around. What functions hold is not seen.
     """
-    weights = getattr(model, "weights", None)
-    if isinstance(weights, Tensor):
-        return constant_arrays(weights) is None
+    of_gps = getattr(model, "prediction_tensors", None)
+    if of_gps is not None:
+        return constant_arrays(*of_gps) is None
     nominal = getattr(model, "nominal", None)
     parts = [getattr(model, "B", None)]
     parts += [getattr(nominal, name, None) for name in ("A", "B", "c")]
@@ -384,6 +384,9 @@ def check_next_states(model: Any) -> tuple[int, int]:
     if model.output_dim != model.state_dim:
         got = f"{model.state_dim} states and {model.output_dim} outputs"
         raise SettingError("model", f"must predict the next state; got {got}")
+    if getattr(model, "predicts", None) == "value":
+        rule = "must predict the next state"
+        raise SettingError("model", f"{rule}; got GPs with predicts='value'")
     return model.state_dim, model.input_dim
 
 

@@ -346,7 +346,8 @@ def _predict_recording(
             last = min(first + CHUNK, size - k)
             count = last - first
             belief = Gaussian(belief.mean[:count], belief.covariance[:count])
-            belief = propagator(model, belief, inputs[first + k : last + k])
+            control = inputs[first + k : last + k]
+            belief = propagator.propagate(model, belief, control).belief
             mean = belief.mean[:, :n].double().cpu()
             variance = (belief.variance[:, :n] + noise.last).double().cpu()
             observed = recording.states[first + k + 1 : last + k + 1].clone()

@@ -300,7 +300,8 @@ class KalmanFilter:
         """Moves a belief (*batch, n) on by a step with an applied input (*batch, m)."""
         check_kind("belief", belief, Gaussian, "a Gaussian")
         belief = belief.in_order(self._names.state_names)
-        return self.propagator(self.model, belief, self._as_input(belief, input))
+        control = self._as_input(belief, input)
+        return self.propagator.propagate(self.model, belief, control).belief
 
     def update(self, belief: Gaussian, measured: Any) -> Update:
         """Corrects a belief (*batch, n) by a measurement y (*batch, p).

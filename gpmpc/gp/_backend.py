@@ -43,8 +43,12 @@ def backend(choice: _Backend) -> Iterator[None]:
         _chosen.reset(token)
 
 
-def host_arrays(*tensors: Tensor) -> list[Array] | None:
+def host_arrays(*tensors: Tensor, gps_on_host: bool) -> list[Array] | None:
     """Returns the tensors as arrays for the compiled loops; None for torch.
+
+    Args:
+        tensors: What GPs are evaluated at.
+        gps_on_host: Whether the GPs are, ``GPPosterior.on_host``.
 
     Raises:
         SettingError: The backend is ``"compiled"``, and only torch can evaluate.
@@ -55,7 +59,7 @@ def host_arrays(*tensors: Tensor) -> list[Array] | None:
     on_host = arrays is not None and all(
         tensor.dtype is torch.float64 for tensor in tensors
     )
-    return arrays if check_and_choose_compiled(on_host) else None
+    return arrays if check_and_choose_compiled(on_host and gps_on_host) else None
 
 
 def check_and_choose_compiled(on_host: bool) -> bool:

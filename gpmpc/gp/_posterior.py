@@ -225,10 +225,23 @@ class GPPosterior(TensorModel):
             self.state_dim,
         )
 
+    @property
+    def prediction_tensors(self) -> tuple[Tensor, ...]:
+        """The tensors that predictions are made of."""
+        return (
+            self.weights,
+            self.lengthscales,
+            self.signal_variance,
+            self.offset,
+            self.features,
+            self.cholesky,
+        )
+
     @cached_property
-    def _on_host(self) -> bool:
-        """Whether the compiled loops can evaluate it: float64 in host memory."""
-        return constant_arrays(self.weights) is not None and self.dtype is torch.float64
+    def on_host(self) -> bool:
+        """Whether compiled loops can evaluate it: constant float64 in host memory."""
+        is_constant = constant_arrays(*self.prediction_tensors) is not None
+        return is_constant and self.dtype is torch.float64
 
     @cached_property
     def _offset_array(self) -> Array:
@@ -344,7 +357,7 @@ class GPPosterior(TensorModel):
 
         The compiled kernels do it where they can, else torch.
         """
-        if check_and_choose_compiled(self._on_host):
+        if check_and_choose_compiled(self.on_host):
             from gpmpc import _kernels as kernels  # loads numba
 
             gps = kernels.linearize_gps(

@@ -238,11 +238,12 @@ class _Evaluation(torch.autograd.Function):
         ctx.save_for_backward(*arguments)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, *grad_outputs: Tensor) -> tuple[Tensor | None, ...]:
         """Multiplies the value's gradient by the Jacobian, which has derivatives too.
 
         A value that torch differentiates again is a call of another function.
         """
+        (gradient,) = grad_outputs
         function = ctx.function
         arguments = ctx.saved_tensors
         batch = arguments[0].shape[:-1]

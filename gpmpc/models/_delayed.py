@@ -224,7 +224,7 @@ class DelayedModel(LinearWrapper):
             acting = pending[k]
             if w != 1:
                 acting = w * pending[k] + (1 - w) * pending[k + 1]
-            belief = propagator(self.model, belief, acting)
+            belief = propagator.propagate(self.model, belief, acting).belief
         if w == 1:
             return belief
         return DelayedModel(self.model, w).augmented(belief, pending[-1:])

@@ -27,7 +27,7 @@ from gpmpc._kernels.gp_rollout import (
 )
 from gpmpc._kernels.tape import NO_TAPE, Tape
 from gpmpc.exceptions import ShapeError
-from gpmpc.gp._backend import host_arrays
+from gpmpc.gp._backend import check_and_choose_compiled
 from gpmpc.gp._posterior import AffineForm
 from gpmpc.models._features import Features
 
@@ -228,7 +228,7 @@ def _feedback_input(
 def _compiled_model(model: DynamicsModel) -> AffineGPs | None:
     """Returns a model's arrays for compiled code; None where it is not of that form."""
     form: AffineForm | None = getattr(model, "affine_form", None)
-    if form is not None and host_arrays(form.f.weights) is not None:
+    if form is not None and check_and_choose_compiled(form.f.on_host):
         return _compiled_form(form, model.state_dim, model.input_dim)
     tape: Tape | None = getattr(model, "tape", None)
     if tape is not None:

@@ -25,6 +25,7 @@ from gpmpc.propagation._propagator import (
     Propagation,
     Sensitivity,
     checked_arguments,
+    holds_for,
 )
 
 
@@ -54,13 +55,13 @@ def expand_to_second_order(
     if form is None or not _is_gp_alone(form):
         return None
     gp = form.f
-    arrays = host_arrays(gp.weights, state, input)
+    arrays = host_arrays(state, input, gps_on_host=gp.on_host)
     if arrays is None:
         return None
     from gpmpc import _kernels as kernels  # loads numba
 
     batch = state.shape[:-1]
-    _, states, inputs = arrays
+    states, inputs = arrays
     states = states.reshape(-1, gp.state_dim)
     inputs = inputs.reshape(len(states), gp.input_dim)
     expansion = kernels.expand_gps(gp.packed, states, inputs)
@@ -106,9 +107,13 @@ class Linearization(NoisyPropagator):
         ``MomentMatching``, ``Unscented`` and ``MonteCarlo``, which also see curvature.
     """
 
-    #: needs the model's mean, derivatives and variance at the belief's mean alone, and
-    #: carries the covariance by A S A' + V
-    first_order = True
+    @property
+    def first_order(self) -> bool:
+        """Whether the model's numbers at the belief's mean are all that is needed.
+
+        Not of a subclass that propagates in another way.
+        """
+        return holds_for(self, "first_order")
 
     def differentiate(
         self, model: Any, belief: Gaussian, input: Tensor | None = None

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from gpmpc._calls import explains_arguments
-from gpmpc._dynamics import Array, tensors_for, to_array
+from gpmpc._dynamics import Array, check_next_states, tensors_for, to_array
 from gpmpc.exceptions import ShapeError, check_kind, check_method
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.propagation._propagator import Propagator, Sensitivity, differentiate
@@ -83,7 +83,8 @@ def linearize(
             f"a local model needs an output a state; got {belief.dim} states, "
             f"{model.output_dim} outputs"
         )
-    expansion = expand_belief(propagator, model, belief, input)
+    with torch.no_grad():
+        expansion = expand_belief(propagator, model, belief, input)
     A = expansion.A
     B = expansion.B
     s = _extended_state(belief.mean, expansion.root)
@@ -203,7 +204,8 @@ def rollout(
 
     Raises:
         ShapeError: The inputs have no step.
-        SettingError: The propagator is none, or the inputs are no tensor.
+        SettingError: The propagator is none, the inputs are no tensor, or the model
+            predicts something else than next states.
 
     >>> import torch
     >>> from gpmpc.gaussian import Gaussian
@@ -219,6 +221,7 @@ def rollout(
         ``gpmpc.calibration.calibrate``, which compares such beliefs with a log.
     """
     check_method("propagator", propagator, "propagate", "Linearization()")
+    check_next_states(model)
     check_tensors(inputs=inputs)
     if inputs.dim() < 2 or not inputs.shape[-2]:
         raise ShapeError(
@@ -227,7 +230,7 @@ def rollout(
         )
     beliefs = []
     for control in inputs.unbind(-2):
-        belief = propagator(model, belief, control)
+        belief = propagator.propagate(model, belief, control).belief
         beliefs.append(belief)
     return Gaussian(
         mean=torch.stack([belief.mean for belief in beliefs], dim=-2),

@@ -116,12 +116,14 @@ class MomentMatching(NoisyPropagator):
 
         Without ``derivatives`` the tensors of the derivatives are empty.
         """
-        arrays = host_arrays(f.weights, belief.mean, belief.covariance, input)
+        arrays = host_arrays(
+            belief.mean, belief.covariance, input, gps_on_host=f.on_host
+        )
         if arrays is None:
             return None
         from gpmpc import _kernels as kernels  # loads numba
 
-        _, mean, covariance, control = arrays
+        mean, covariance, control = arrays
         batch = mean.shape[:-1]
         H = math.prod(batch)
         matched = kernels.moments(

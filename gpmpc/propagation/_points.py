@@ -53,6 +53,8 @@ from gpmpc.propagation._propagator import (
 )
 
 _log = logging.getLogger(__name__)
+# spread of sigma points below which their weights, about 1 / alpha^2, leave no digits
+_LEAST_ALPHA = 1e-7
 # samples of all beliefs of a batch that are predicted at once: a GP's points' kernels
 # at them are as many times N * outputs numbers, by torch times n + m
 _CHUNK = 1000
@@ -96,7 +98,8 @@ class Unscented(NoisyPropagator):
         process_noise: Whether the model's noise covariance is added.
 
     Raises:
-        SettingError: alpha is not positive, or (at the first step) n + kappa is not.
+        SettingError: alpha is below 1e-7, or (at the first step) n + kappa is not
+            positive.
 
     >>> import torch
     >>> from gpmpc.gaussian import Gaussian
@@ -117,7 +120,7 @@ class Unscented(NoisyPropagator):
         kappa: float = 0.0,
         process_noise: bool = True,
     ):
-        check_number("alpha", alpha, above=0)
+        check_number("alpha", alpha, least=_LEAST_ALPHA)
         check_number("beta", beta)
         check_number("kappa", kappa)
         super().__init__(process_noise)
@@ -130,8 +133,9 @@ class Unscented(NoisyPropagator):
     ) -> tuple[Propagation, Sensitivity] | None:
         """Propagates with all derivatives, by those of the model at every point.
 
-        Returns None where the model has no closed ones. Where Sigma is singular its
-        root has no derivative in the null space; zero is taken there.
+        Returns None where the model has no closed ones. Where an eigenvalue of Sigma is
+        zero its root has no derivative; zero is taken there, and so are derivatives by
+        a Sigma of zero. Next to it, by round-off too, they have other limits.
         """
         input = checked_arguments(model, belief, input)
         eigenvalues, U = torch.linalg.eigh(belief.covariance)

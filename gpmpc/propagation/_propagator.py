@@ -106,7 +106,7 @@ class Propagator(Protocol):
             ShapeError: Belief or input do not fit the model.
             SettingError: Their dtype or device is another one.
             DataError: An entry is not finite, or the covariance is not positive
-                semidefinite.
+                semidefinite; or the predicted covariance is not finite.
             UnsupportedModel: There is no formula for this model.
         """
         ...
@@ -179,8 +179,8 @@ def differentiate(
 
     Returns:
         What ``propagator.propagate`` returns, and the derivatives. Where the covariance
-        had to be projected they are those of the projection (autograd) or of the matrix
-        that was projected (closed form).
+        had to be projected, a closed form gives those of the matrix that was projected,
+        and autograd, for models without a closed form, those of the projection.
 
     >>> import torch
     >>> from gpmpc.gaussian import Gaussian
@@ -197,11 +197,26 @@ def differentiate(
     """
     check_method("propagator", propagator, "propagate", "Linearization()")
     closed_form = getattr(propagator, "differentiate", None)
-    if closed_form is not None:
+    if closed_form is not None and holds_for(propagator, "differentiate"):
         result = closed_form(model, belief, input)
         if result is not None:
             return result
     return by_autograd(propagator, model, belief, input)
+
+
+def holds_for(propagator: Any, name: str) -> bool:
+    """Whether what a class says of its way to propagate holds for a propagator.
+
+    A subclass that propagates in another way inherits what is no longer true.
+    """
+    if name in vars(propagator):
+        return True
+    for owner in type(propagator).__mro__:
+        if name in vars(owner):
+            return True
+        if "propagate" in vars(owner) or "_next_moments" in vars(owner):
+            return False
+    return True
 
 
 def by_autograd(

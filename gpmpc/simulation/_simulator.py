@@ -354,7 +354,10 @@ class ModelSimulator:
     def step(self, input: Array) -> Diverged | None:
         """Carries the belief one step on; returns why it cannot go on, if so."""
         control = torch.as_tensor(np.asarray(input, dtype=float)).to(self._belief.mean)
-        belief = self.loop.propagator(self.loop.model, self._belief, control)
+        propagated = self.loop.propagator.propagate(
+            self.loop.model, self._belief, control
+        )
+        belief = propagated.belief
         mean_is_finite = is_measured(to_array(belief.mean)).all()
         covariance_is_finite = torch.isfinite(belief.covariance).all()
         if not (mean_is_finite and covariance_is_finite):

@@ -1,6 +1,8 @@
 """Closed-form derivatives against torch autograd through the torch evaluation, for
 every model that has them."""
 
+from dataclasses import replace
+
 import casadi
 import pytest
 import torch
@@ -9,7 +11,7 @@ from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend, remove_points
-from gpmpc.models import Affine, CasadiFunction, DelayedModel, ResidualModel
+from gpmpc.models import Affine, CasadiFunction, DelayedModel, KnownModel, ResidualModel
 from gpmpc.propagation import (
     Linearization,
     MeanEquivalence,
@@ -18,6 +20,7 @@ from gpmpc.propagation import (
     Unscented,
     differentiate,
     linearize,
+    rollout,
 )
 from gpmpc.propagation._propagator import by_autograd
 from tests.propagation.test_moment_matching import belief, model
@@ -300,9 +303,65 @@ def test_any_number_of_outputs_has_derivatives(propagator, n, k):
 def test_no_gradient_flows_through_a_local_model():
     gp = MODELS["difference"]
     control = torch.zeros(2, requires_grad=True)
-    local = linearize(MomentMatching(), gp, Gaussian.certain([0.1, 0.2, 0.3]), control)
-    assert not local.A.requires_grad
-    assert not local.c.requires_grad
+    at = Gaussian.certain([0.1, 0.2, 0.3])
+    local = linearize(MomentMatching(), gp, at, control)
+    weights = gp.weights.clone().requires_grad_()
+    of_leaf = linearize(MomentMatching(), replace(gp, weights=weights), at, control)
+    for part in (local.A, local.c, of_leaf.next.mean, of_leaf.next.covariance):
+        assert not part.requires_grad
+
+
+def test_lengthscales_alone_may_be_leaves():
+    gp = MODELS["difference"]
+    lengthscales = gp.lengthscales.clone().requires_grad_()
+    followed = replace(gp, lengthscales=lengthscales)
+    for propagator in (MomentMatching(), Linearization(), Unscented()):
+        after = propagator(followed, belief(3), torch.zeros(2))
+        (slope,) = torch.autograd.grad(after.mean.sum(), lengthscales)
+        assert slope.any()
+        expected = propagator(gp, belief(3), torch.zeros(2)).mean
+        assert torch.allclose(after.mean, expected, atol=1e-12)
+
+
+class DoubledVariance(Linearization):
+    def _next_moments(self, model, belief, input):
+        moments = super()._next_moments(model, belief, input)
+        return moments._replace(covariance=2.0 * moments.covariance)
+
+
+class OnlyPropagates:
+    def propagate(self, model, belief, input=None):
+        return Linearization().propagate(model, belief, input)
+
+
+def test_a_propagator_of_ones_own_is_taken_by_its_word():
+    gp = MODELS["difference"]
+    control = torch.zeros(2)
+    own = DoubledVariance(process_noise=False)
+    assert Linearization().first_order
+    assert not own.first_order
+    propagation, slopes = differentiate(own, gp, belief(3), control)
+    expected, closed = differentiate(Linearization(False), gp, belief(3), control)
+    covariance = 2.0 * expected.belief.covariance
+    assert torch.allclose(propagation.belief.covariance, covariance)
+    assert torch.allclose(slopes.covariance_by_mean, 2.0 * closed.covariance_by_mean)
+    inputs = torch.zeros(2, 2)
+    beliefs = rollout(OnlyPropagates(), gp, belief(3), inputs)
+    assert torch.equal(
+        beliefs.mean, rollout(Linearization(), gp, belief(3), inputs).mean
+    )
+
+
+def test_misuse_is_refused_by_a_rule():
+    with pytest.raises(SettingError, match="alpha: must be a number, 1e-07 or more"):
+        Unscented(alpha=1e-200)
+    values = value_model(2, 1, 2)
+    with pytest.raises(SettingError, match="model: must predict the next state"):
+        rollout(MomentMatching(), values, belief(2), torch.zeros(2, 1))
+    broken = KnownModel(lambda x, u: x / x.sum(-1, keepdim=True), 2, 0)
+    for propagator in (Linearization(), Unscented()):
+        with pytest.raises(DataError, match="a predicted covariance must be finite"):
+            propagator(broken, Gaussian(torch.zeros(2), torch.eye(2)))
 
 
 @pytest.mark.parametrize("choice", ["auto", "torch"])
