@@ -342,7 +342,10 @@ class TestBadInput:
 
 def test_settings_out_of_range_are_refused():
     for make, message in (
-        (lambda: Unscented(alpha=0.0), "alpha: must be a number above 0; got 0.0"),
+        (
+            lambda: Unscented(alpha=0.0),
+            "alpha: must be a number, 1e-07 or more; got 0.0",
+        ),
         (lambda: Unscented(beta=torch.nan), "beta: must be a number; got nan"),
         (
             lambda: MomentMatching(diagonal="false"),
