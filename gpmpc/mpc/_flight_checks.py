@@ -28,7 +28,7 @@ WINDOW = 8  # steps over which innovations, novelty and failures are looked at
 BIAS_WINDOW = 16  # steps over which innovations are to cancel each other
 _CHANGES = 40  # differences of innovations that say how large the sensors' noise is
 _FEWEST = 4  # of them, before any innovation is judged
-_DOUBT = 10.0  # differences, for as many of which their median is taken twice
+_DOUBT = 10.0  # differences: the median of as many is doubled, of more less so
 _GROWTH = (6, 20)  # least and most steps in each half of a window of growth
 _LONG = 20  # steps that a promise is followed for at most
 _RING = 2 * _GROWTH[1] + 1  # steps that distances and costs are remembered for
@@ -75,7 +75,7 @@ STATE_MEMORY = np.dtype(
         ("deviations", np.float64, BIAS_WINDOW),  # innovations over their deviations
         ("bias", np.float64),  # their sum
         ("change_count", np.int64),  # differences of successive innovations so far
-        ("changes", np.float64, _CHANGES),  # their squares
+        ("squared_changes", np.float64, _CHANGES),  # their squares
         ("ordered_changes", np.float64, _CHANGES),  # the same, from the smallest on
         ("sensor_variance", np.float64),  # the sensors' part of the innovations
         ("motion", np.float64),  # largest squared predicted motion, forgotten slowly
@@ -94,14 +94,15 @@ STATE_MEMORY = np.dtype(
     ]
 )
 # What it has shown of all states together. Of the rings of ``_RING`` slots, two turn
-# after that many steps; the other three only use the first ``look_ahead`` slots, and
-# turn after as many steps.
+# after that many steps; the other three only use the first ``promise_window`` slots,
+# and turn after as many steps.
 FLIGHT_MEMORY = np.dtype(
     [
         ("step", np.int64),  # number of the step, from 0
-        ("changes", np.int64),  # steps so far in which any state had a change
+        ("steps_with_change", np.int64),  # steps so far in which any state had a change
         ("horizon", np.int64),  # of the last plan that was applied; 0 at first
-        ("look_ahead", np.int64),  # steps that a promise is followed for; 0 at first
+        # steps that a promise is followed for; 0 at first
+        ("promise_window", np.int64),
         ("since_news", np.int64),  # steps since the reference's end has moved
         # steps since the plant came nearer to it, or was there
         ("since_nearer", np.int64),
@@ -120,12 +121,13 @@ FLIGHT_MEMORY = np.dtype(
         ("nearest", np.float64),  # distance on the way there; infinite at rest
         ("distances", np.float64, _RING),
         ("costs", np.float64, _RING),  # of plans
-        # modulo look_ahead: squared moves of the reference's end
-        ("news", np.float64, _RING),
-        ("paid", np.float64, _RING),  # modulo look_ahead: squared distances
-        # modulo look_ahead: by the plan of a step for the next look_ahead steps; NaN
+        # modulo promise_window: squared moves of the reference's end, which no plan
+        # before has known
+        ("allowances", np.float64, _RING),
+        ("paid", np.float64, _RING),  # modulo promise_window: squared distances
+        # modulo promise_window: by the plan of a step, for as many steps after it; NaN
         # where there was none
-        ("promised", np.float64, _RING),
+        ("promises", np.float64, _RING),
         ("far", np.float64, WINDOW),  # 1 where a plan was far from the data
         ("failed", np.float64, WINDOW),  # 1 where a decision was not applied
     ]
@@ -181,7 +183,7 @@ class _Distance(NamedTuple):
     """How far the plant is from its reference, in the cost's metric."""
 
     now: float
-    least: float  # that matters
+    negligible_below: float  # a distance that does not matter
 
 
 class _Course(NamedTuple):
@@ -198,7 +200,7 @@ class _Course(NamedTuple):
 def new_flight_memory() -> Array:
     """Returns the memory (1,) of all states together at the start of a flight."""
     flight = np.zeros(1, FLIGHT_MEMORY)
-    flight["promised"] = np.nan
+    flight["promises"] = np.nan
     return flight
 
 
@@ -253,11 +255,11 @@ def judge_step(
         return MISFIT
     flight = memory.flight[0]
     _remember_measurement(memory, measured)
-    planned_squares, promised = _plan_distances(settings, reading)
+    planned_squares, promise = _plan_distances(settings, reading)
     if reading.is_applied:
         flight.horizon = len(means) - 1
-    if flight.look_ahead == 0:
-        flight.look_ahead = min(flight.horizon, _LONG)
+    if flight.promise_window == 0:
+        flight.promise_window = min(flight.horizon, _LONG)
 
     # The order counts: sensor variances come from the innovations, distances need these
     # variances, and a promise is followed after the news that may withdraw it.
@@ -266,7 +268,7 @@ def judge_step(
     distance = _follow_distance(settings, memory, reading.reference)
     _remember_reference(settings, memory, reading.reference)
     _remember_first_cost(flight, planned_squares)
-    promise_ratio = _follow_promise(flight, distance, promised)
+    promise_ratio = _follow_promise(flight, distance, promise)
     course = _follow_course(flight, distance, planned_squares, promise_ratio)
     far_plans = _follow_novelty(flight, reading.novelty)
     predicts_well = (
@@ -385,7 +387,7 @@ def _follow_innovations(settings, memory):
             most_biased = Alarm(BIAS, i, largest_bias / BIAS_WINDOW)
         if _remember_change(state, innovation):
             has_change = True
-    flight.changes += has_change
+    flight.steps_with_change += has_change
     return largest, most_biased
 
 
@@ -455,7 +457,7 @@ def _insert_change(state, value):
     if state.change_count < _CHANGES:
         j = state.change_count
     else:
-        j = _find(ordered, state.changes[slot])
+        j = _find(ordered, state.squared_changes[slot])
         while j < _CHANGES - 1 and ordered[j + 1] < value:
             ordered[j] = ordered[j + 1]
             j += 1
@@ -463,7 +465,7 @@ def _insert_change(state, value):
         ordered[j] = ordered[j - 1]
         j -= 1
     ordered[j] = value
-    state.changes[slot] = value
+    state.squared_changes[slot] = value
     state.change_count += 1
 
 
@@ -488,7 +490,7 @@ def _follow_sensors(settings, memory):
     A sensor that has shown the same before, and then gone on, has coarse steps: it may.
     So may one without noise, whose state was to stay where it is.
     """
-    changing = 0
+    moving_sensors = 0
     for i in range(len(memory.states)):
         state = memory.states[i]
         if state.measured != state.measured:
@@ -501,9 +503,9 @@ def _follow_sensors(settings, memory):
                 state.is_coarse = 1.0
             state.repeats = 0.0
             state.missed_moves = 0.0
-            changing += 1
+            moving_sensors += 1
         state.last_measured = state.measured
-    if changing == 0 or memory.flight[0].changes < _FEWEST:
+    if moving_sensors == 0 or memory.flight[0].steps_with_change < _FEWEST:
         return _WELL
     for i in range(len(memory.states)):
         state = memory.states[i]
@@ -590,7 +592,7 @@ def _remember_reference(settings, memory, reference):
         flight.since_news = 0
     else:
         flight.since_news += 1
-    flight.news[flight.step % max(flight.look_ahead, 1)] = move
+    flight.allowances[flight.step % max(flight.promise_window, 1)] = move
     now = reference[0]
     following = reference[min(1, len(reference) - 1)]
     is_as_announced = True
@@ -603,7 +605,7 @@ def _remember_reference(settings, memory, reference):
         state.horizon_end = reference[-1, i]
     if not is_as_announced:  # no plan has promised anything of this
         for j in range(_RING):
-            flight.promised[j] = np.nan
+            flight.promises[j] = np.nan
 
 
 @njit_noalloc
@@ -668,14 +670,15 @@ def _plan_distances(settings, reading):
 
 
 @njit_noalloc
-def _follow_promise(flight, distance, promised):
+def _follow_promise(flight, distance, promise):
     """What steps cost over what a plan promised for them; 0 where it is not known.
 
     In optimal control the cost falls by what is paid (Gruene and Rantzer, 2008,
-    section 3).
+    section 3). At step 30, with a window of 20, slot 10 holds the promise of step 10
+    for the steps 11 .. 30, and gets that of step 30.
     """
     k = flight.step
-    h = flight.look_ahead
+    h = flight.promise_window
     if h == 0:
         return 0.0
     slot = k % h
@@ -685,16 +688,17 @@ def _follow_promise(flight, distance, promised):
     flight.paid[slot] = nearer * nearer
     # The slot still holds what step k - h promised. Noise was not promised, nor what
     # prepares for a reference that is known later.
-    allowed = flight.promised[slot] + 0.25 * h * distance.least * distance.least
+    negligible_square = distance.negligible_below * distance.negligible_below
+    allowed_cost = flight.promises[slot] + 0.25 * h * negligible_square
     is_comparable = min(flight.horizon, _LONG) == h
-    flight.promised[slot] = promised if is_comparable else np.nan
-    if k < h or flight.changes <= _FEWEST:  # the noise is not known yet
+    flight.promises[slot] = promise if is_comparable else np.nan
+    if k < h or flight.steps_with_change <= _FEWEST:  # the noise is not known yet
         return 0.0
     paid = 0.0
     for j in range(h):
         paid += flight.paid[j]
-        allowed += flight.news[j]
-    ratio = paid / (allowed + 1e-300)
+        allowed_cost += flight.allowances[j]
+    ratio = paid / (allowed_cost + 1e-300)
     return ratio if ratio == ratio else 0.0
 
 
@@ -704,15 +708,15 @@ def _follow_course(flight, distance, planned_squares, promise_ratio):
     k = flight.step
     flight.distances[k % _RING] = distance.now
     flight.costs[k % _RING] = planned_squares
-    half = min(max(flight.look_ahead // 2, _GROWTH[0]), _GROWTH[1])
-    was_away = flight.distances[(k - half) % _RING] > distance.least
+    half = min(max(flight.promise_window // 2, _GROWTH[0]), _GROWTH[1])
+    was_away = flight.distances[(k - half) % _RING] > distance.negligible_below
     was_nearer = flight.distances[(k - 2 * half) % _RING] < distance.now
     cost_ratio = 0.0
     if flight.since_news > _LONG and flight.first_cost > 0.0:
         cost_ratio = planned_squares / flight.first_cost
     return _Course(
         distance=distance.now,
-        matters=distance.now > distance.least,
+        matters=distance.now > distance.negligible_below,
         promise_ratio=promise_ratio,
         cost_ratio=cost_ratio,
         distance_grows=was_away and _is_growing(flight.distances, k, half),
@@ -833,7 +837,7 @@ def _follow_approach(flight, distance):
 
     Steps at rest are no steps on the way: what is pushed away then begins a new one.
     """
-    if distance.now <= distance.least:
+    if distance.now <= distance.negligible_below:
         flight.nearest = np.inf
         flight.since_nearer = 0
         return _WELL
@@ -858,7 +862,7 @@ def _follow_bounds(settings, memory, input, distance):
     alarm = _WELL
     long = 2 * max(_LONG, memory.flight[0].horizon)
     for j in range(len(settings.lower)):
-        if distance.now <= distance.least:
+        if distance.now <= distance.negligible_below:
             memory.at_bound[j] = 0
             continue
         if input[j] != input[j]:

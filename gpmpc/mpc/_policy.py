@@ -78,7 +78,8 @@ class Command:
     #: nothing was
     plan: Decision | None
     #: that the step began in (n,), of a model whose state holds its past; None of
-    #: others. ``plan`` is of this state, ``decision`` of what is measured of it
+    #: others. Means of ``plan`` are of all of this state, those of ``decision`` of its
+    #: first entries, which are measured
     state: np.ndarray | None = None
 
     @property
@@ -393,7 +394,7 @@ class ControlLoop:
             correction = self._gains_of(plan)[stage][:, :n] @ error
             if np.isfinite(correction).all():
                 input = input - correction
-        last_input = _input_of(self.controller, self._before_last)
+        last_input = _input_before(self.controller, self._before_last)
         if stage > 0:
             last_input = plan.inputs[stage - 1]
         return _within_bounds(self.controller, input, last_input)
@@ -531,7 +532,7 @@ def _plan_of_policy(
     """
     if last is None or last.plan is None or not last.plan.applicable:
         return None
-    plan = _one_step_on(last.plan)
+    plan = _shifted(last.plan)
     input = _input_of_policy(on_failure, plan, last)
     # bounds may change from stage to stage
     input = _within_bounds(controller, input, last.input)
@@ -553,7 +554,7 @@ def _input_of_policy(
     return plan.inputs[0]
 
 
-def _one_step_on(plan: Decision) -> Decision:
+def _shifted(plan: Decision) -> Decision:
     """Returns a plan as if it had been made one step ago; its ends are held."""
     return replace(
         plan,
@@ -581,7 +582,7 @@ def _plan_without_prediction(
     if known_input is None or not np.isfinite(known_input).all():
         return None
     input = _within_bounds(
-        controller, np.array(known_input, dtype=float), _input_of(controller, last)
+        controller, np.array(known_input, dtype=float), _input_before(controller, last)
     )
     H = reference.horizon
     n = reference.states.shape[1]
@@ -643,7 +644,7 @@ def _admit(
 
     None where it must not be applied.
     """
-    input = _within_bounds(controller, plan.input, _input_of(controller, last))
+    input = _within_bounds(controller, plan.input, _input_before(controller, last))
     miss = np.abs(input - plan.input)
     tolerance = _ROUNDING * np.maximum(1.0, np.abs(input))
     is_rounding = (miss <= tolerance).all()  # the miss of a NaN is a NaN
@@ -654,7 +655,7 @@ def _admit(
     return _with_first(plan, plan.inputs, input)
 
 
-def _input_of(controller: Controller, last: Command | None) -> np.ndarray | None:
+def _input_before(controller: Controller, last: Command | None) -> np.ndarray | None:
     """Returns the input of a command, or the one before the first; None if unknown."""
     if last is not None:
         return last.input

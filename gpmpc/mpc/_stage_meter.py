@@ -61,7 +61,9 @@ class CostSum(NamedTuple):
         """
         if self.beyond > expected.beyond:
             return True
-        if not self.total - expected.total > share * whole.weighed:
+        # What moves from one of the two parts to the other makes nothing dearer.
+        rises_altogether = self.total - expected.total > share * whole.weighed
+        if not rises_altogether:
             return False
         weighed_rises = self.weighed - expected.weighed > share * whole.weighed
         violation_rise = self.violations - expected.violations

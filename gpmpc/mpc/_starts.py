@@ -13,7 +13,7 @@ as a whole, and followed under its feedback.
     pursuit       the flight that is followed: what it was expected to cost, and what
                   is left of that                                   (``_Pursuit``)
     question      what a controller is asked at any state           (``Question``)
-    situation     the arguments of a decision                       (``_Situation``)
+    arguments     those of ``control`` at one step                  (``_StepArguments``)
 """
 
 import math
@@ -62,7 +62,7 @@ _STILL = 1e-3  # share of its bounds within which an input is as good as constan
 _DEARER = 1e-3  # share of its cost by which a new plan may be dearer than the last one
 
 
-class _Situation(NamedTuple):
+class _StepArguments(NamedTuple):
     """The arguments of ``control`` at one step."""
 
     belief: Gaussian
@@ -85,7 +85,9 @@ class _Pursuit(NamedTuple):
     """What a decision on the way to a set point leaves for the next one."""
 
     goal: Array  # the set point (n,)
-    expected: CostSum  # of the whole flight when it was found, or of one before
+    # of the whole flight when it was found, or of one before if that was dearer: what
+    # shares are shares of
+    whole_cost: CostSum
     remaining: CostSum  # what is still to be paid of it
     dearest: float  # of the stages so far, violations left out
     age: int  # decisions since it was found
@@ -101,7 +103,7 @@ class _Pursuit(NamedTuple):
         """Returns that of the controller's own plan to a set point."""
         return cls(
             goal=goal,
-            expected=costs.sum(),
+            whole_cost=costs.sum(),
             remaining=costs.sum(),
             dearest=costs.dearest,
             age=0,
@@ -118,14 +120,14 @@ class _Pursuit(NamedTuple):
 
         What a flight to the same goal was to cost before still counts.
         """
-        expected = flight.cost_sum
+        whole_cost = flight.cost_sum
         dearest = flight.costs.dearest
         if last is not None:
-            expected = expected.largest(last.expected)
+            whole_cost = whole_cost.largest(last.whole_cost)
             dearest = max(dearest, last.dearest)
         return cls(
             goal=goal,
-            expected=expected,
+            whole_cost=whole_cost,
             remaining=flight.cost_sum,
             dearest=dearest,
             age=0,
@@ -376,10 +378,10 @@ class ManyStarts:
         if previous is not None and self._can_continue(previous):
             turns = full_turns(state - previous.means[1], self._angles)
             belief = replace(belief, mean=belief.mean - torch.as_tensor(turns))
-        situation = _Situation(belief, reference, previous, parameters)
+        arguments = _StepArguments(belief, reference, previous, parameters)
         if self._judges_flights and _is_set_point(reference):
-            return self._follow_flight(situation)
-        return self._follow_plan(situation)
+            return self._follow_flight(arguments)
+        return self._follow_plan(arguments)
 
     def plans(
         self,
@@ -415,21 +417,21 @@ class ManyStarts:
     def _can_continue(self, previous: Decision) -> bool:
         return previous.applicable and len(previous.means) == self.horizon + 1
 
-    def _follow_plan(self, situation: _Situation) -> Decision:
+    def _follow_plan(self, arguments: _StepArguments) -> Decision:
         """Returns the last plan, improved or kept; a new one where there is none."""
-        previous = situation.previous
+        previous = arguments.previous
         if previous is not None and self._can_continue(previous):
-            decision = self._improve(situation, previous)
+            decision = self._continue_or_keep(arguments, previous)
             if decision.applicable:
                 return decision
-        return self._search_plan(situation)
+        return self._search_plan(arguments)
 
-    def _search_plan(self, situation: _Situation) -> Decision:
+    def _search_plan(self, arguments: _StepArguments) -> Decision:
         """Returns the plan that the criterion likes best.
 
         That is the controller's own, or one of all starts.
         """
-        belief, reference, previous, parameters = situation
+        belief, reference, previous, parameters = arguments
         deadline = self._deadline()
         last = _without_solution(previous)
         best = self.controller.control(belief, reference, last, parameters)
@@ -445,51 +447,52 @@ class ManyStarts:
                 break
         return best
 
-    def _follow_flight(self, situation: _Situation) -> Decision:
+    def _follow_flight(self, arguments: _StepArguments) -> Decision:
         """Returns the decision on the way to a set point that was found, or a new one.
 
         Steps of a flight are followed as long as it costs what it was to cost; once it
         is no longer than a horizon, the controller's own plans are.
         """
-        question = self._question(situation)
-        pursuit = self._pursuit(situation)
+        question = self._read_question(arguments)
+        # Of the last decision's step, until ``after_flown_stage``.
+        pursuit = self._last_pursuit(arguments)
         current = None  # what is left of the flight that was followed
         if pursuit is not None and pursuit.flight is not None:
             current = self._remaining_flight(
-                pursuit.flight, pursuit, situation, question
+                pursuit.flight, pursuit, arguments, question
             )
             pursuit = pursuit.after_flown_stage(current, self.horizon)
             if self._is_as_expected(current, pursuit):
-                return self._decide_along(current, pursuit, situation, question)
+                return self._decide_along(current, pursuit, arguments, question)
         else:
-            decision = self._continue_plan(situation, question, pursuit)
+            decision = self._continue_plan(arguments, question, pursuit)
             if decision is not None:
                 return decision
-        return self._search_anew(situation, question, pursuit, current)
+        return self._search_anew(arguments, question, pursuit, current)
 
     def _continue_plan(
-        self, situation: _Situation, question: Question, pursuit: _Pursuit | None
+        self, arguments: _StepArguments, question: Question, pursuit: _Pursuit | None
     ) -> Decision | None:
         """Returns the controller's decision from its last plan.
 
-        None where there is no plan, or where it has lost the goal.
+        None where there is no plan, or where it needs a new search.
         """
-        previous = situation.previous
+        previous = arguments.previous
         if previous is None or not self._can_continue(previous):
             return None
-        decision = self._improve(situation, previous)
+        decision = self._continue_or_keep(arguments, previous)
         costs = self._foresight.meter(decision.means, decision.inputs, question)
-        if not decision.applicable or self._is_lost(costs, pursuit):
+        if not decision.applicable or self._needs_new_search(costs, pursuit):
             return None
         states = decision.means
-        next_pursuit = _Pursuit.of_plan(np.array(situation.end), costs, states)
+        next_pursuit = _Pursuit.of_plan(np.array(arguments.end), costs, states)
         if pursuit is not None:
             next_pursuit = pursuit.after_decision(costs, states)
         return _FollowedDecision.of(decision, next_pursuit)
 
     def _search_anew(
         self,
-        situation: _Situation,
+        arguments: _StepArguments,
         question: Question,
         pursuit: _Pursuit | None,
         current: ModelFlight | None,
@@ -499,22 +502,22 @@ class ManyStarts:
         ``current`` is what is left of the flight that was followed. Where no flight is
         found the decision is that of the best plan.
         """
-        flight = self._search_flight(situation, question, current)
+        flight = self._search_flight(arguments, question, current)
         if flight is None:
-            return self._search_plan(situation)
+            return self._search_plan(arguments)
         pursuit = _Pursuit.of_flight(
-            goal=np.array(situation.end),
+            goal=np.array(arguments.end),
             flight=flight,
             horizon=self.horizon,
             last=pursuit,
         )
-        return self._decide_along(flight, pursuit, situation, question)
+        return self._decide_along(flight, pursuit, arguments, question)
 
     def _remaining_flight(
         self,
         flight: ModelFlight,
         pursuit: _Pursuit,
-        situation: _Situation,
+        arguments: _StepArguments,
         question: Question,
     ) -> ModelFlight:
         """Returns what is left of a flight, from the state that its stage led to.
@@ -523,10 +526,10 @@ class ManyStarts:
         """
         foresight = self._foresight
         remaining = foresight.follow(
-            flight.after(1), situation.state, question, pursuit.dearest
+            flight.after(1), arguments.state, question, pursuit.dearest
         )
         is_dearer = remaining.cost_sum.is_dearer(
-            pursuit.remaining_after_stage, _DRIFT, pursuit.expected
+            pursuit.remaining_after_stage, _DRIFT, pursuit.whole_cost
         )
         if remaining.arrives and is_dearer:
             remaining = foresight.improve(
@@ -537,32 +540,32 @@ class ManyStarts:
 
     def _is_as_expected(self, flight: ModelFlight, pursuit: _Pursuit) -> bool:
         """Tells whether a flight costs what it was to, and arrives if it was to."""
-        if flight.cost_sum.is_dearer(pursuit.remaining, _RISE, pursuit.expected):
+        if flight.cost_sum.is_dearer(pursuit.remaining, _RISE, pursuit.whole_cost):
             return False
         return flight.arrives or not pursuit.arrives
 
-    def _question(self, situation: _Situation) -> Question:
+    def _read_question(self, arguments: _StepArguments) -> Question:
         """Returns what the controller is asked on the way, beside its last plan."""
-        previous = situation.previous
+        previous = arguments.previous
         disturbance = None if previous is None else previous.disturbance
         return Question(
-            covariance=situation.belief.covariance,
-            reference=situation.reference,
-            parameters=situation.parameters,
+            covariance=arguments.belief.covariance,
+            reference=arguments.reference,
+            parameters=arguments.parameters,
             previous_input=self._input_before(previous),
             disturbance=disturbance,
         )
 
-    def _pursuit(self, situation: _Situation) -> _Pursuit | None:
+    def _last_pursuit(self, arguments: _StepArguments) -> _Pursuit | None:
         """Returns what the last decision left; None for another goal."""
-        previous = situation.previous
+        previous = arguments.previous
         if not isinstance(previous, _FollowedDecision) or previous.pursuit is None:
             return None
-        if not np.array_equal(previous.pursuit.goal, situation.end):
+        if not np.array_equal(previous.pursuit.goal, arguments.end):
             return None
         return previous.pursuit.after_failed_steps(previous, self.horizon)
 
-    def _is_lost(self, costs: FlownCosts, pursuit: _Pursuit | None) -> bool:
+    def _needs_new_search(self, costs: FlownCosts, pursuit: _Pursuit | None) -> bool:
         """Tells whether a plan with the costs of its stages is to be searched anew."""
         if pursuit is None:
             return not self._foresight.arrives(costs)
@@ -572,7 +575,7 @@ class ManyStarts:
         is_dearer = (
             costs[: len(promised)]
             .sum()
-            .is_dearer(promised.sum(), _RISE, pursuit.expected)
+            .is_dearer(promised.sum(), _RISE, pursuit.whole_cost)
         )
         return is_dearer or pursuit.age >= self._foresight.longest
 
@@ -580,25 +583,25 @@ class ManyStarts:
         self,
         flight: ModelFlight,
         pursuit: _Pursuit,
-        situation: _Situation,
+        arguments: _StepArguments,
         question: Question,
     ) -> Decision:
         """Returns the decision whose plan are the first stages of a flight."""
         means = flight.states[: self.horizon + 1]
         inputs = flight.inputs[: self.horizon]
         decision = self.controller.control(
-            situation.belief,
+            arguments.belief,
             self._nearest_turn(question.reference, means[-1]),
-            situation.previous,
+            arguments.previous,
             question.parameters,
             plan=(inputs, means),
         )
         return _FollowedDecision.of(
-            self._with_plan(decision, inputs, means, situation.previous), pursuit
+            self._with_plan(decision, inputs, means, arguments.previous), pursuit
         )
 
     def _search_flight(
-        self, situation: _Situation, question: Question, current: ModelFlight | None
+        self, arguments: _StepArguments, question: Question, current: ModelFlight | None
     ) -> ModelFlight | None:
         """Returns the cheapest flight of all starts, under its feedback.
 
@@ -610,26 +613,26 @@ class ManyStarts:
         )
         if current is not None and current.costs.are_finite.all():
             search.add(current)
-        for beginning in self._controller_beginnings(situation):
+        for beginning in self._controller_beginnings(arguments):
             search.fly(beginning)
             if search.is_late:
                 break
-        for states, inputs in self._beginnings(situation, question):
+        for states, inputs in self._beginnings(arguments, question):
             if search.is_late:
                 break
             search.fly(Trajectory(search.best_controller, states, inputs))
         best = search.best()
         if best is None:
             return None
-        return self._foresight.follow(best, situation.state, question)
+        return self._foresight.follow(best, arguments.state, question)
 
-    def _controller_beginnings(self, situation: _Situation) -> Iterator[Trajectory]:
+    def _controller_beginnings(self, arguments: _StepArguments) -> Iterator[Trajectory]:
         """Makes beginnings of the controller by itself.
 
         That is from its last plan, without one, and with shorter horizons.
         """
-        previous = situation.previous
-        here = situation.state[None]
+        previous = arguments.previous
+        here = arguments.state[None]
         nothing = np.empty((0, self.problem.input_dim))
         if previous is not None and self._can_continue(previous):
             yield Trajectory(self.controller, here, nothing, previous)
@@ -637,15 +640,15 @@ class ManyStarts:
             yield Trajectory(controller, here, nothing)
 
     def _beginnings(
-        self, situation: _Situation, question: Question
+        self, arguments: _StepArguments, question: Question
     ) -> Iterator[tuple[Array, Array]]:
         """Makes states and inputs of the plans of all starts, and of relays."""
         foresight = self._foresight
-        state = situation.state
-        last = _without_solution(situation.previous)
+        state = arguments.state
+        last = _without_solution(arguments.previous)
         different: list[Array] = []
         for decision, _ in self.plans(
-            situation.belief, question.reference, last, question.parameters
+            arguments.belief, question.reference, last, question.parameters
         ):
             inputs = decision.inputs
             states = decision.means
@@ -666,20 +669,22 @@ class ManyStarts:
                 yield states, inputs
         yield from foresight.relays(state, question)
 
-    def _improve(self, situation: _Situation, previous: Decision) -> Decision:
+    def _continue_or_keep(
+        self, arguments: _StepArguments, previous: Decision
+    ) -> Decision:
         """Returns the controller's decision from the last plan.
 
         Where that plan costs less, it is kept.
         """
-        goal = self._nearest_turn(situation.reference, previous.means[-1])
-        inputs = np.concatenate([previous.inputs[1:], previous.inputs[-1:]])
-        means = np.concatenate([previous.means[1:], previous.means[-1:]])
+        goal = self._nearest_turn(arguments.reference, previous.means[-1])
+        shifted_inputs = one_step_on(previous.inputs)
+        shifted_means = one_step_on(previous.means)
         decision = self.controller.control(
-            situation.belief,
+            arguments.belief,
             goal,
             previous,
-            situation.parameters,
-            plan=(inputs, means),
+            arguments.parameters,
+            plan=(shifted_inputs, shifted_means),
         )
 
         def plan_cost(means: Array, inputs: Array) -> float:
@@ -688,7 +693,7 @@ class ManyStarts:
                 inputs,
                 goal,
                 previous_input=self._input_before(previous),
-                parameters=situation.parameters,
+                parameters=arguments.parameters,
             )
 
         limit = inf
@@ -696,24 +701,25 @@ class ManyStarts:
             if self._has_tubes:
                 return decision  # which the last plan, moved on, may have left
             limit = plan_cost(decision.means, decision.inputs) / (1.0 + _DEARER)
-        if plan_cost(means, inputs) >= limit:
+        # From the state itself it will hardly cost less: no roll-out is worth its time.
+        if plan_cost(shifted_means, shifted_inputs) >= limit:
             return decision
         shifted = replace(
             previous,
-            inputs=inputs,
-            means=means,
+            inputs=shifted_inputs,
+            means=shifted_means,
             covariances=one_step_on(previous.covariances),
         )
         try:
-            gains = self.controller.gains(shifted, situation.parameters)
+            gains = self.controller.gains(shifted, arguments.parameters)
         except FAILURES:  # where the model has no slopes
             return decision
-        question = self._question(situation._replace(reference=goal))
-        states, inputs = self._foresight.roll_out(
-            means, inputs, gains, situation.state, question
+        question = self._read_question(arguments._replace(reference=goal))
+        rolled_states, rolled_inputs = self._foresight.roll_out(
+            shifted_means, shifted_inputs, gains, arguments.state, question
         )
-        if plan_cost(states, inputs) < limit:
-            return self._with_plan(decision, inputs, states, previous)
+        if plan_cost(rolled_states, rolled_inputs) < limit:
+            return self._with_plan(decision, rolled_inputs, rolled_states, previous)
         return decision
 
     def _with_plan(

@@ -296,9 +296,9 @@ def test_a_flight_that_grazes_a_hard_bound_is_measured_by_its_other_stages():
         pursuit = pursuit.after_flown_stage(flight.after(stages), 3)
         assert pursuit.remaining == CostSum(left[0], 0.0, left[1])
         remaining = flight.after(stages).cost_sum
-        assert not remaining.is_dearer(pursuit.remaining, 0.1, pursuit.expected)
+        assert not remaining.is_dearer(pursuit.remaining, 0.1, pursuit.whole_cost)
         dearer = remaining._replace(weighed=remaining.weighed + 2.0)
-        assert dearer.is_dearer(pursuit.remaining, 0.1, pursuit.expected)
+        assert dearer.is_dearer(pursuit.remaining, 0.1, pursuit.whole_cost)
 
 
 def test_feedback_of_a_flight_weighs_outputs_as_it_weighs_states():

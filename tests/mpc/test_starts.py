@@ -712,9 +712,9 @@ def test_after_failed_steps_a_plan_is_compared_stage_by_stage(failed_steps):
     pursuit = pursuit.after_failed_steps(previous, horizon=5)
     now = failed_steps + 1
     assert pursuit.costs.total.tolist() == stages[failed_steps:5].tolist()
-    assert not many._is_lost(costs(now), pursuit)
+    assert not many._needs_new_search(costs(now), pursuit)
     dearer = replace(costs(now), errors=1.5 * costs(now).errors)
-    assert many._is_lost(dearer, pursuit)
+    assert many._needs_new_search(dearer, pursuit)
 
 
 def test_a_planner_that_does_not_fit_is_named():
