@@ -10,10 +10,13 @@
 
 enum { BATCHES = 4, ROUNDS = 10, REFINEMENTS = GPMPC_IS_FLOAT ? 6 : 3 };
 
-/* The largest number of changes of the working set. */
-static int iteration_limit(const gpmpc_program *work)
+/* The largest number of changes of the working set in a try that follows others. A limit
+   that was asked for is one of all tries; an ample one begins anew. */
+static int changes_left(const gpmpc_program *work, int changes_before)
 {
-    return GPMPC_ITERATIONS > 0 ? GPMPC_ITERATIONS : 100 + 10 * (N + work->rows);
+    if (GPMPC_ITERATIONS > 0)
+        return GPMPC_ITERATIONS - changes_before;
+    return 100 + 10 * (N + work->rows);
 }
 
 static int constraint_count(const gpmpc_program *work) { return N + work->rows; }
@@ -70,8 +73,9 @@ static int factorise(gpmpc_program *work)
     return 1;
 }
 
-/* Writes the norms and where rows of G end. Returns what cancellation left of the
-   pivots of P, as a share of P_ii; zero if a norm is not finite. */
+/* Writes the norms and where rows of G end. The norm is one for a row of zeros, and for
+   one whose squares underflow, which no factor here can hold. Returns what cancellation
+   left of the pivots of P, as a share of P_ii; zero if a norm is not finite. */
 static real measure_rows(gpmpc_program *work)
 {
     real *units = work->scratch;
@@ -437,18 +441,23 @@ static real end_of_range(const gpmpc_program *work, int slot, real rate)
 }
 
 /* Shortens a step so that it keeps the multipliers in range; returns the slot that ends
-   it, or k. */
+   it, or k. A rate r_i that may be rounding blocks nothing. The unit of r_i is that of
+   its row, so it is weighed by the length of w_i, whose square is K_ii. */
 static int first_blocking(const gpmpc_program *work, int k, real sense, real *step)
 {
-    real largest = 0;
+    real largest_square = 0;
+    real rounding;
     int blocking = k;
     int i;
-    for (i = 0; i < k; i++)
-        largest = larger(largest, absolute(work->direction[i]));
+    for (i = 0; i < k; i++) {
+        real rate = work->direction[i];
+        largest_square = larger(largest_square, rate * rate * work->diagonal[i]);
+    }
+    rounding = NO_RATE * NO_RATE * largest_square;
     for (i = 0; i < k; i++) {
         real rate = sense * work->direction[i];
         real room;
-        if (!(absolute(rate) > NO_RATE * largest))
+        if (!(rate * rate * work->diagonal[i] > rounding))
             continue;
         room = (work->multiplier[constraint_in(work, i)]
                 - end_of_range(work, i, rate)) / rate;
@@ -615,6 +624,7 @@ typedef struct {
     int status;
     int size;       /* k, of the working set */
     int iterations;
+    int limit;      /* of the iterations */
     int batches_left;
     int violated;    /* whether any constraint was */
     int passed_over; /* whether one contradicts others by what may be rounding */
@@ -627,7 +637,6 @@ static void iterate(gpmpc_program *work, Progress *progress, int starts, int gue
     int candidates = guessed;
     int all_listed = 1; /* whether the list was made of all constraints */
     int k = progress->size;
-    int limit = iteration_limit(work);
     int violated = 0;
     fill(work->multiplier_low, 0, constraint_count(work));
     progress->status = GPMPC_SOLVED;
@@ -637,7 +646,7 @@ static void iterate(gpmpc_program *work, Progress *progress, int starts, int gue
         int single, p = 0, look_at_all;
         if (!starts) { /* select the violated constraint p, or several at once */
             violated = 1;
-            if (progress->iterations >= limit) {
+            if (progress->iterations >= progress->limit) {
                 progress->status = GPMPC_ITERATION_LIMIT;
                 break;
             }
@@ -679,7 +688,8 @@ static void iterate(gpmpc_program *work, Progress *progress, int starts, int gue
             k = drop_wrong_multipliers(work, k);
         minimise(work, k);
         /* first satisfy those that were seen to be violated, then look at all */
-        look_at_all = count == 1 || work->soft || progress->iterations >= limit;
+        look_at_all = count == 1 || work->soft
+                      || progress->iterations >= progress->limit;
         all_listed = look_at_all || !single;
         if (!all_listed) {
             count = recheck_violated(work, margin, count);
@@ -917,9 +927,11 @@ static void write_solution(const gpmpc_program *work, const Progress *progress,
 /* Solves the opened program in rounds: iterate, refine x on its working set, look for
    violations that are left. */
 static void solve_opened(const gpmpc_problem *problem, gpmpc_program *work,
-                         const gpmpc_solution *guess, gpmpc_solution *solution)
+                         const gpmpc_solution *guess, int limit,
+                         gpmpc_solution *solution)
 {
-    Progress progress = {GPMPC_NUMERICAL_TROUBLE, 0, 0, BATCHES, 0, 0};
+    Progress progress = {GPMPC_NUMERICAL_TROUBLE, 0, 0, limit, BATCHES, 0, 0};
+    real fine = smaller(FINE, GPMPC_TOLERANCE);
     real margin = LATER * work->length_of_q; /* small ones wait for the refined x */
     int first_round = 1;
     int rounds = 0;
@@ -948,7 +960,7 @@ static void solve_opened(const gpmpc_problem *problem, gpmpc_program *work,
                               SQRT(least_pivot_share(work, progress.size)));
         finest = finest || progress.passed_over || pivot_share < ILL;
         largest_residual = DOUBT * pivot_share;
-        tolerance = smaller(finest ? FINEST : FINE, largest_residual);
+        tolerance = smaller(finest ? FINEST : fine, largest_residual);
         residual = refine(problem, work, progress.size, tolerance, &length, &changed);
         progress.status = residual <= smaller(GPMPC_TOLERANCE, largest_residual)
                               ? GPMPC_SOLVED
@@ -1079,12 +1091,12 @@ static void solve(const gpmpc_problem *problem, gpmpc_program *work,
         fill(solution->x, 0, N);
         return;
     }
-    solve_opened(problem, work, guess, solution);
+    solve_opened(problem, work, guess, changes_left(work, 0), solution);
     if (is_certain(work, solution))
         return;
     iterations = solution->iterations;
     if (read_bounds(work))
-        solve_opened(problem, work, solution, solution);
+        solve_opened(problem, work, solution, changes_left(work, iterations), solution);
     solution->iterations += iterations;
     if (!is_certain(work, solution))
         rescue_solution(problem, work, solution);

@@ -367,13 +367,14 @@ static int satisfy_accurately(Rescue *rescue, gpmpc_program *work,
                               const Violation *violation, real rounding)
 {
     int p = violation->p;
+    int side = violation->side;
     real sense = (real)violation->sense;
     real amount = violation->amount;
     real multiplier_before = work->multiplier[p];
     for (;;) {
         int k = rescue->size;
-        real distance, square, step, room;
-        int independent, capped, blocking, i;
+        real distance, square, step, range_end, room;
+        int independent, reaches_range_end, blocking, i;
         factorise_working(rescue, work);
         write_column(work, p, work->w[k]);
         distance = orthogonalise(work, k, work->w[k], work->direction);
@@ -381,9 +382,9 @@ static int satisfy_accurately(Rescue *rescue, gpmpc_program *work,
         square = distance * distance;
         independent = k < N && distance > rescue->dependent * rescue->length[p];
         step = independent ? amount / square : INFINITY;
-        room = sense > 0 ? most_of(work, p, violation->side) - work->multiplier[p]
-                         : work->multiplier[p] - least_of(work, p, violation->side);
-        capped = room < step;
+        range_end = sense > 0 ? most_of(work, p, side) : least_of(work, p, side);
+        room = (range_end - work->multiplier[p]) * sense;
+        reaches_range_end = room < step;
         step = smaller(step, room);
         blocking = first_to_block(rescue, work, violation->sense, &step);
         if (step > LARGEST || (!independent && amount <= rounding)) {
@@ -399,17 +400,19 @@ static int satisfy_accurately(Rescue *rescue, gpmpc_program *work,
         amount -= step * square;
         if (blocking < 0) {
             rescue->iterations++;
-            if (!capped)
-                add_working(rescue, work, p, violation->side);
+            if (reaches_range_end) /* rounding has put it beside that */
+                set_multiplier(work, p, range_end);
+            else
+                add_working(rescue, work, p, side);
             return 1;
         }
         {
             int leaving = constraint_in(work, blocking);
             real rate = sense * work->direction[blocking];
-            int side = side_in(work, blocking);
+            int leaving_side = side_in(work, blocking);
             drop_working(rescue, work, blocking,
-                         rate > 0 ? least_of(work, leaving, side)
-                                  : most_of(work, leaving, side));
+                         rate > 0 ? least_of(work, leaving, leaving_side)
+                                  : most_of(work, leaving, leaving_side));
         }
     }
 }
@@ -439,7 +442,7 @@ static int prove_contradiction(const Rescue *rescue, gpmpc_program *work,
 }
 
 /* Changes the working set until no constraint is violated; returns the status. */
-static int run_rescue(Rescue *rescue, gpmpc_program *work)
+static int run_rescue(Rescue *rescue, gpmpc_program *work, int limit)
 {
     for (;;) {
         Violation violation;
@@ -449,7 +452,7 @@ static int run_rescue(Rescue *rescue, gpmpc_program *work)
             return GPMPC_NUMERICAL_TROUBLE;
         if (!find_violation(rescue, work, &violation))
             return GPMPC_SOLVED;
-        if (rescue->iterations >= iteration_limit(work))
+        if (rescue->iterations >= limit)
             return GPMPC_ITERATION_LIMIT;
         rounding = ROUNDING_OF_DATA
                    * rounded_terms_of(work, violation.p, violation.side);
@@ -473,10 +476,12 @@ static void rescue_solution(const gpmpc_problem *problem, gpmpc_program *work,
                             gpmpc_solution *solution)
 {
     static const real dependent[DEPENDENT_TRIES] = DEPENDENT_DISTANCES;
-    Progress progress = {GPMPC_NUMERICAL_TROUBLE, 0, 0, 0, 0, 0};
+    Progress progress = {GPMPC_NUMERICAL_TROUBLE, 0, 0, 0, 0, 0, 0};
     Rescue rescue;
     int guessed = solution->working;
     int attempt, i;
+    progress.iterations = solution->iterations;
+    progress.limit = solution->iterations + changes_left(work, solution->iterations);
     for (i = 0; i < guessed; i++)
         work->candidates[i] = solution->label[i];
     for (i = 0; i < constraint_count(work); i++) {
@@ -490,11 +495,12 @@ static void rescue_solution(const gpmpc_problem *problem, gpmpc_program *work,
         if (!GPMPC_IS_FLOAT && attempt >= DEPENDENT_TRIES)
             break;
         start_rescue(&rescue, work, guessed);
-        progress.status = run_rescue(&rescue, work);
+        progress.status =
+            run_rescue(&rescue, work, progress.limit - progress.iterations);
+        progress.iterations += rescue.iterations;
         if (progress.status != GPMPC_NUMERICAL_TROUBLE)
             break;
     }
-    progress.iterations = solution->iterations + rescue.iterations;
     progress.size = rescue.size;
     write_solution(work, &progress, solution);
 }

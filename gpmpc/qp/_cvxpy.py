@@ -35,10 +35,10 @@ from scipy.linalg import cho_solve, solve_triangular
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
-from gpmpc.qp._dual_rescue import rescue
+from gpmpc.qp._dual_rescue import polish
 from gpmpc.qp._primal_active_set import farkas_ray
 from gpmpc.qp._problem import ABSENT, QuadraticProgram, check_positive
-from gpmpc.qp._solution import QPSolution, WarmStart, make_solution
+from gpmpc.qp._solution import QPSolution, WarmStart, largest_residual, make_solution
 from gpmpc.status import Status
 
 Array = NDArray[np.float64]
@@ -120,8 +120,7 @@ class CvxpySolver:
             if solution.status is Status.INFEASIBLE:
                 return solution
             # no interior point reaches zero
-            residuals = solution.residuals(zero=1.0)
-            residual = np.nan_to_num(np.max(residuals), nan=np.inf)
+            residual = largest_residual(solution, zero=1.0)
             if solution.status is Status.SOLVED and residual <= self.tolerance:
                 return solution
             if best is None or residual < least:
@@ -131,7 +130,7 @@ class CvxpySolver:
         if best.status is Status.SOLVED:
             best.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
             if self.options is None:  # its working set may be right all the same
-                best.record[:] = rescue(problem, best.caps, best.record)
+                return polish(best, self.tolerance, zero=1.0)
         return best
 
     def _run(self, program: Any, warm_start: bool, options: dict | None) -> Status:

@@ -34,7 +34,7 @@ from gpmpc.qp._problem import (
     multiplier_caps,
 )
 from gpmpc.qp._solution import QPSolution, WarmStart, as_record, proves_infeasibility
-from gpmpc.qp._workspace import new_memory, prepare_memory
+from gpmpc.qp._workspace import new_memory, prepare_memory, with_limit
 
 Array = NDArray[np.float64]
 
@@ -72,8 +72,10 @@ class DualActiveSet:
         tolerance: Largest residual of a solution called ``SOLVED``, as a share of its
             size. One that was computed in doubled digits is held to a tolerance of its
             own (``gpmpc.qp._dual_rescue``).
-        iteration_limit: Changes of the working set before ``ITERATION_LIMIT``; ample if
-            omitted. Under a time limit it may be passed by up to 50 changes.
+        iteration_limit: Changes of the working set before ``ITERATION_LIMIT``, those of
+            a second try and of doubled digits included; ample if omitted. It is looked
+            at between steps, in one of which several constraints may enter or leave.
+            Under a time limit it may be passed by up to 50 changes.
         time_limit: Seconds before ``TIME_LIMIT``; none if omitted.
 
     Raises:
@@ -280,9 +282,14 @@ class DualActiveSet:
         # it returns MISUSE: the copy then stays as it is.
         guess = record
         record = record.copy()
+        keeps_count = self.iteration_limit is not None  # an ample limit begins anew
+        if keeps_count:
+            memory = with_limit(memory, limit - iterations)
         solve_kernel(*problem, guess, memory, record)
         record[layout.ITERATIONS] += iterations
         if not _is_final(record, problem, caps):
+            if keeps_count:
+                limit -= int(record[layout.ITERATIONS])
             record = rescue(problem, caps, record, limit, late)
         return problem, record
 

@@ -62,6 +62,8 @@ _DOUBTFUL_SQUARE = 1e-4
 _ROUNDING_OF_BOUNDS = 1e-15
 # A dependent constraint violated by more than this share of its terms contradicts.
 _HOPELESS = 1e-7
+# The square of the share of the longest r_i w_i below which r_i may be rounding.
+_NO_RATE_SQUARE = 1e-24
 
 
 class Progress(NamedTuple):
@@ -282,16 +284,19 @@ def _satisfy_constraint(work, k, p):
 def _first_blocking(work, k, sense, step):
     """Returns the longest step that keeps the multipliers in range, and what ends it.
 
-    That is a slot, or k where ``step`` is not too long for any.
+    That is a slot, or k where ``step`` is not too long for any. A rate r_i that may be
+    rounding blocks nothing. The unit of r_i is that of its row, so it is weighed by the
+    length of w_i: the square of |r_i w_i| is r_i^2 K_ii.
     """
     r = work.direction
-    largest = 0.0
+    largest_square = 0.0
     for i in range(k):
-        largest = max(largest, abs(r[i]))
+        largest_square = max(largest_square, r[i] * r[i] * work.diagonal[i])
+    rounding = _NO_RATE_SQUARE * largest_square
     blocking = k
     for i in range(k):
         rate = sense * r[i]
-        if abs(rate) > 1e-12 * largest:
+        if rate * rate * work.diagonal[i] > rounding:
             range_end = _end_of_range(work, i, rate)
             room = (work.multiplier[constraint_in(work, i)] - range_end) / rate
             if room < step:

@@ -152,7 +152,7 @@ def _is_dense_matrix(A):
 def _is_record_of(record, n, M):
     """Returns whether a record is that of a program of this size."""
     return (
-        len(record) > HEADER
+        len(record) >= HEADER + n + 2 * M
         and record[VARIABLES] == n
         and record[CONSTRAINTS] == M
         and 0 <= record[WORKING] <= M
@@ -163,7 +163,8 @@ def _is_record_of(record, n, M):
 def _measure_rows(work):
     """Writes the norms, and where the rows of G end.
 
-    The norm of c_p is the length of the vector of c_pj / sqrt(P_jj).
+    The norm of c_p is the length of the vector of c_pj / sqrt(P_jj), or its largest
+    entry where the squares are too small for a float; one for a row of zeros.
 
     Returns what cancellation left of the pivots of P, as a share of P_ii; zero if a
     norm is not finite.
@@ -180,13 +181,17 @@ def _measure_rows(work):
     for i in range(work.m):
         row = work.G[i]
         squares = zeros()
+        entries = zeros()
         row_end = 0
         for j in range(0, n, 8):
             values = load_some(row, j) * load(units, j)
             squares = squares + values * values
+            entries = larger_magnitude(entries, values)
             if any_nonzero(values):
                 row_end = j + 8
         norm = math.sqrt(total(squares))
+        if norm == 0.0:
+            norm = largest(entries)
         undefined += norm * 0.0
         work.norm[n + i] = norm if norm > 0.0 else 1.0
         work.row_end[n + i] = min(row_end, n)
@@ -255,6 +260,7 @@ def _solve_opened(work, guess, out):
     if len(guess) > 0 and guess[STATUS] == ITERATION_LIMIT:
         batches_left = 0  # only single steps let the dual objective rise for sure
 
+    fine = min(_FINE, work.tolerance)
     margin = _FIRST_MARGIN * work.length_of_q  # small violations wait for the refined x
     first_round = True
     rounds = 0
@@ -286,7 +292,7 @@ def _solve_opened(work, guess, out):
         pivot_share = min(work.pivot_share, math.sqrt(_least_pivot_share(work, k)))
         finest = finest or passed_over or pivot_share < _ILL_CONDITIONED_SHARE
         largest_residual = _RESIDUAL_PER_PIVOT_SHARE * pivot_share
-        refined = refine(work, k, min(_FINEST if finest else _FINE, largest_residual))
+        refined = refine(work, k, min(_FINEST if finest else fine, largest_residual))
         accurate = refined.residual <= min(work.tolerance, largest_residual)
         status = SOLVED if accurate else NUMERICAL_TROUBLE
         changed = changed or refined.moved

@@ -25,7 +25,13 @@ from scipy.linalg import qr, solve_triangular
 
 from gpmpc.qp import _record as layout
 from gpmpc.qp._problem import ABSENT
-from gpmpc.qp._solution import proves_infeasibility, zero_row_size
+from gpmpc.qp._solution import (
+    QPSolution,
+    largest_residual,
+    proves_infeasibility,
+    zero_row_size,
+)
+from gpmpc.status import Status
 
 Array = NDArray[np.float64]
 
@@ -42,6 +48,8 @@ _DEPENDENT_DISTANCES = (1e-14, 1e-13, 1e-12, 1e-10)
 # A guessed constraint is this many times as far from the others: if it is nearer and
 # does matter, it is found violated and enters later.
 _GUESS_MARGIN = 1e6
+# A solution that takes more changes was none: they cost a factorisation each.
+_CHANGES_OF_POLISH = 20
 _CONVERGED = 1e-12  # last correction of x, as a share of its size
 _CORRECTIONS = 12
 
@@ -51,7 +59,7 @@ def rescue(
     problem: tuple,
     caps: Array,
     record: Array,
-    limit: int = 20,
+    limit: int = _CHANGES_OF_POLISH,
     late: Callable[[], bool] = lambda: False,
 ) -> Array:
     """Returns the record of a solve that starts from the working set of another.
@@ -60,11 +68,13 @@ def rescue(
         problem: P, q, G, lower and upper; bounds of 1e20 or more are absent.
         caps: (M,), see ``gpmpc.qp._problem.multiplier_caps``.
         record: What the kernel wrote.
-        limit: Changes of the working set before ``ITERATION_LIMIT``.
+        limit: Changes of the working set before ``ITERATION_LIMIT``, those for all
+            dependent distances together.
         late: Whether it is time for ``TIME_LIMIT``.
     """
     P, q, G, lower, upper = problem
     result = record.copy()
+    iterations = 0
     try:
         lower = np.where(lower <= -ABSENT, -np.inf, lower)
         upper = np.where(upper >= ABSENT, np.inf, upper)
@@ -73,16 +83,44 @@ def rescue(
             solver = _AccurateSolver(
                 (P, q, G, lower, upper), caps, dependent_distance, late
             )
-            result[layout.STATUS] = solver.run(labels, limit)
+            result[layout.STATUS] = solver.run(labels, limit - iterations)
+            iterations += solver.iterations
             if result[layout.STATUS] != layout.NUMERICAL_TROUBLE:
                 break
+        # that of the last distance, also where none succeeded
         solver.write(result)  # pyright: ignore[reportPossiblyUnboundVariable]
+        result[layout.ITERATIONS] += iterations
     except TimeoutError:
         result[layout.STATUS] = layout.TIME_LIMIT
     except (ArithmeticError, ValueError, np.linalg.LinAlgError):
         # not finite, or not positive definite once scaled
         result[layout.STATUS] = layout.NUMERICAL_TROUBLE
     return result
+
+
+def polish(solution: QPSolution, tolerance: float, zero: float = 1e-12) -> QPSolution:
+    """Returns the better of a solution and what doubled digits make of it, judged.
+
+    They change the last digits only of a solution whose working set is right. From a
+    wrong one they may end elsewhere, and at a worse point.
+
+    Args:
+        solution: Of any solver.
+        tolerance: Largest residual of what is called ``SOLVED``.
+        zero: As for ``QPSolution.residuals``.
+    """
+    record = rescue(solution.arrays, solution.caps, solution.record)
+    x = record[layout.HEADER :][: len(solution.x)]
+    polished = solution._replace(x=x, record=record)
+    if polished.status is Status.INFEASIBLE:  # which is proven
+        return polished
+    before = largest_residual(solution, zero)
+    after = largest_residual(polished, zero)
+    better = polished if after <= max(before, tolerance) else solution
+    is_solved = min(before, after) <= tolerance
+    status = layout.SOLVED if is_solved else layout.NUMERICAL_TROUBLE
+    better.record[layout.STATUS] = status
+    return better
 
 
 class _Violated(NamedTuple):
@@ -188,7 +226,6 @@ class _AccurateSolver:
             side * (p + 1) for p, side in self.working.items()
         ]
         record[[layout.WORKING, layout.VARIABLES, layout.CONSTRAINTS]] = k, n, M
-        record[layout.ITERATIONS] += self.iterations
 
     def _bound(self, p: int, side: int) -> float:
         return self.upper[p] if side > 0 else self.lower[p]
@@ -346,13 +383,15 @@ class _AccurateSolver:
             # step direction
             self._factorise()
             r, square = self._project(p)
-            independent = np.sqrt(square) > self.dependent_distance * self.norms[p]
+            is_far = np.sqrt(square) > self.dependent_distance * self.norms[p]
+            independent = is_far and len(self.working) < self.n
 
             # step length
             step = violation / square if independent else np.inf
             least, most = self._range(p, violated.side)
-            room = most - mu[p] if sense > 0 else mu[p] - least
-            capped = room < step
+            range_end = most if sense > 0 else least
+            room = (range_end - mu[p]) * sense
+            reaches_range_end = room < step
             blocking = self._first_blocking(mu, sense * r, min(step, room))
             step = blocking.step
             if step == np.inf or (not independent and violation <= rounding):
@@ -364,9 +403,11 @@ class _AccurateSolver:
             mu[p] += sense * step
             violation -= step * square
             if blocking.p < 0:
-                self.mu[:, p] = mu[p], 0.0
                 self.iterations += 1
-                if not capped:
+                if reaches_range_end:  # not mu[p], which rounding has put beside it
+                    self.mu[:, p] = range_end, 0.0
+                else:
+                    self.mu[:, p] = mu[p], 0.0
                     self.working[p] = violated.side
                 return None
             mu[blocking.p] = blocking.multiplier

@@ -35,7 +35,7 @@ from scipy.optimize import linprog
 
 from gpmpc._calls import explains_arguments
 from gpmpc.qp import _record as layout
-from gpmpc.qp._dual_rescue import rescue
+from gpmpc.qp._dual_rescue import polish
 from gpmpc.qp._problem import (
     ABSENT,
     QuadraticProgram,
@@ -173,8 +173,7 @@ class PrimalActiveSet:
     ) -> QPSolution:
         """Returns the solution with its last digits, once its residuals are checked.
 
-        ``rescue`` runs after every solve that found a point: from the working set of a
-        solution it changes the last digits only.
+        Doubled digits follow every solve that found a point.
         """
         nothing = np.zeros(len(problem.lower))
         solution = make_solution(
@@ -186,11 +185,7 @@ class PrimalActiveSet:
             iterations=outcome.iterations,
         )
         if outcome.status in (Status.SOLVED, Status.NUMERICAL_TROUBLE):
-            # in place: ``solution.x`` is a view of the record
-            solution.record[:] = rescue(problem, solution.caps, solution.record)
-            infeasible = solution.status is Status.INFEASIBLE
-            if not infeasible and not solution.is_optimal(self.tolerance):
-                solution.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
+            return polish(solution, self.tolerance)
         return solution
 
 

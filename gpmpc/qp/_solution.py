@@ -227,6 +227,15 @@ class QPSolver(Protocol):
         ...
 
 
+def largest_residual(solution: QPSolution, zero: float = 1e-12) -> float:
+    """Returns the largest residual, infinity where one cannot be said.
+
+    See ``QPSolution.residuals`` for ``zero``.
+    """
+    largest = np.max(solution.residuals(zero))
+    return np.inf if np.isnan(largest) else float(largest)
+
+
 def _largest_ratio(residuals: ArrayLike, sizes: ArrayLike) -> float:
     """Returns the largest of ``residuals / sizes``, zero where both are."""
     ratios = np.zeros(np.shape(residuals))

@@ -145,6 +145,14 @@ def new_memory(
     return memory
 
 
+def with_limit(memory: Array, limit: float) -> Array:
+    """Returns a copy of memory with another limit of changes."""
+    copy = aligned_rows(*memory.shape)
+    copy[:] = memory
+    copy[0, _LIMIT] = min(limit, memory[0, _LIMIT])
+    return copy
+
+
 def prepare_memory(memory: Array, G: Array) -> None:
     """Completes prepared memory in which a solve has left the factor of P.
 

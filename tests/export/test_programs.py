@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from gpmpc.qp import DualActiveSet, QuadraticProgram
+from gpmpc.qp._solution import proves_infeasibility
 from gpmpc.status import Status
 from tests.export.programs import CompiledPrograms
 
@@ -40,9 +41,14 @@ def test_a_zero_row_proves_infeasibility_beyond_rounding_only(compiled):
 PRICED_ROWS = [[1e7, 0.0], [0.0, 1e-6], [-1.0, -1.0]]
 
 
-def test_a_row_at_a_price_contradicts_nothing(compiled):
+def test_a_row_at_a_price_contradicts_nothing(compiled, monkeypatch):
     """Two rows of sizes far apart bound x; the first may be violated for next to
     nothing."""
+
+    def rescue(*arguments):
+        raise AssertionError("solved again with doubled digits")
+
+    monkeypatch.setattr("gpmpc.qp._dual_active_set.rescue", rescue)
     problem = QuadraticProgram(
         np.eye(2), [-10.0, -10.0], PRICED_ROWS, h_upper=[1e7, 1e-6, -3.0]
     )
@@ -54,5 +60,9 @@ def test_a_row_at_a_price_contradicts_nothing(compiled):
     for result in (solution, again, answer):
         assert result.status is Status.SOLVED
         np.testing.assert_allclose(result.x, [2.0, 1.0], rtol=1e-9)
-    assert DualActiveSet().solve(problem).status is Status.INFEASIBLE
+    hard = DualActiveSet().solve(problem)
+    assert hard.status is Status.INFEASIBLE
+    proof = hard.multipliers, problem.G, problem.lower, problem.upper
+    assert proves_infeasibility(*proof)
+    assert not proves_infeasibility(*proof, solution.caps)
     assert compiled.solve(problem).status is Status.INFEASIBLE

@@ -14,6 +14,7 @@ import pytest
 from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
 from gpmpc.status import Status
 from tests.qp.problems import feasible_problem, integer_problem
+from tests.qp.test_near_dependence import near_dependent_problem
 
 PACKAGE = Path(__file__).resolve().parents[2] / "gpmpc"
 
@@ -67,6 +68,25 @@ def test_the_time_limit_stops_a_long_solve_not_a_short_one(mode, rng):
     assert patient.status is Status.SOLVED
     assert patient.iterations > 2 * hurried.iterations
     np.testing.assert_allclose(patient.x, full.x, atol=1e-9)
+
+
+def test_all_tries_of_a_program_count_together():
+    """It is tried a second time, and with doubled digits."""
+    rng = np.random.default_rng(0)
+    for _ in range(400):
+        problem = near_dependent_problem(rng, feasible=False)
+        solution = DualActiveSet(iteration_limit=6).solve(problem)
+        assert solution.iterations <= 6 + len(problem.q)  # as many enter at once
+
+
+def test_a_tolerance_near_rounding_needs_no_doubled_digits(rng, monkeypatch):
+    def rescue(*arguments):
+        raise AssertionError("solved again with doubled digits")
+
+    monkeypatch.setattr("gpmpc.qp._dual_active_set.rescue", rescue)
+    for _ in range(100):
+        solution = DualActiveSet(tolerance=1e-14).solve(feasible_problem(rng, 20, 30))
+        assert solution.status is Status.SOLVED
 
 
 def test_the_primal_method_says_when_it_stops_early(rng):

@@ -8,8 +8,10 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from gpmpc.qp import DualActiveSet, QuadraticProgram
+from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
+from gpmpc.qp._dual_rescue import _AccurateSolver, rescue
 from gpmpc.qp._dual_rescue import _add as add_to_pair
+from gpmpc.qp._record import HEADER, INFEASIBLE, SOLVED, STATUS, warm_record
 from gpmpc.status import Status
 
 
@@ -64,6 +66,37 @@ def test_solved_means_optimal_and_infeasible_means_infeasible(
         elif feasible:
             assert solution.status is not Status.INFEASIBLE
     assert solved > (200 if feasible or soft else 20)
+
+
+@pytest.mark.parametrize("seed", [7, 66])
+def test_the_primal_method_keeps_a_solution_that_doubled_digits_lose(seed):
+    problem = near_dependent_problem(np.random.default_rng(seed))
+    solution = PrimalActiveSet().solve(problem)
+    assert solution.status is Status.SOLVED
+    assert solution.is_optimal(1e-9)
+
+
+def test_doubled_digits_put_a_multiplier_on_its_cap(rng):
+    """An equality goes from one cap to the other in two steps.
+
+    The second row comes to its price between them.
+    """
+    problem = QuadraticProgram([[1]], [10], [[1], [0.3]], [2, 9], [2, np.inf])
+    guess = warm_record(np.array([0, -1, 0]), 1)
+    for price, step in rng.uniform([1.1, 0.0], [1.2, 0.1], (20, 2)):
+        prices = [price, (40.0 - price + step) / 0.3]
+        record = rescue(problem, np.append(np.inf, prices), guess)
+        assert record[STATUS] == SOLVED
+        np.testing.assert_array_equal(np.abs(record[HEADER + 2 :][:2]), prices)
+
+
+def test_doubled_digits_take_no_more_rows_than_variables():
+    """However little of a row counts as a distance from the others."""
+    problem = QuadraticProgram(
+        np.eye(2), [-9, -9], [[3, 1], [1, 7], [-1, -1 / 3]], h_upper=[1, 1, -1]
+    )
+    solver = _AccurateSolver(problem, np.full(5, np.inf), 0.0, lambda: False)
+    assert solver.run(np.zeros(0), 20) == INFEASIBLE
 
 
 def test_a_multiplier_towards_a_contradiction_is_reset(rng):

@@ -76,13 +76,15 @@ def test_a_refused_problem_is_not_answered_from_stale_memory(monkeypatch):
     assert solution.is_optimal(1e-9) or not solution.status.solved
 
 
+@pytest.mark.parametrize(("size", "bound"), [(1e300, -1.0), (1e-170, -1e-170)])
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
-def test_a_row_whose_norm_overflows_is_not_taken_as_satisfied(mode):
+def test_a_row_whose_squares_no_float_holds_is_not_taken_as_satisfied(
+    mode, size, bound
+):
     q = np.array([1.0, -2.0, 1.0])
-    upper = np.array([np.inf, np.inf, np.inf, -1.0])
-    solution = solve_in(
-        mode, np.eye(3), q, np.array([[1e300, 2e300, 0.0]]), np.full(4, -np.inf), upper
-    )
+    upper = np.array([np.inf, np.inf, np.inf, bound])
+    row = size * np.array([[1.0, 2.0, 0.0]])
+    solution = solve_in(mode, np.eye(3), q, row, np.full(4, -np.inf), upper)
     assert solution.is_optimal(1e-9) or not solution.status.solved
 
 

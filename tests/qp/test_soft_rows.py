@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
+from gpmpc.qp._record import HEADER
 from gpmpc.status import Status
 from tests.qp.problems import feasible_problem, worst_residual
 
@@ -152,6 +153,17 @@ def test_a_sequence_of_soft_problems_is_the_same_warm_and_cold(solve, rng):
         np.testing.assert_allclose(last.x, cold.x, atol=1e-9)
         at_caps += int((np.abs(last.z) == prices).sum())
     assert at_caps > 0
+
+
+@DUAL
+def test_a_record_that_was_cut_off_is_not_read_beyond_its_end(solve, rng):
+    """What lies behind it in memory says which rows stay violated."""
+    problem = conflicting_problem(rng, 4, 12)
+    cold = solve(problem, np.full(12, 0.1))
+    assert (np.abs(cold.z) == 0.1).any()
+    cut_off = cold._replace(record=cold.record[: HEADER + 4])
+    again = solve(problem, np.full(12, 0.1), cut_off)
+    assert again.iterations == cold.iterations
 
 
 @DUAL
