@@ -21,6 +21,7 @@ enum {
     N = GPMPC_SIZE
 };
 
+/* b where either is NaN, as in ``smaller`` */
 static real larger(real a, real b) { return a > b ? a : b; }
 
 static real smaller(real a, real b) { return a < b ? a : b; }

@@ -5,7 +5,8 @@
 
    as in gpmpc/qp/_dual_iteration.py, where it is explained. A constraint p is
    represented by w_p = L^-T c_p with P = L'L, so that K_pq = c_p'P^-1 c_q = w_p'w_q.
-   The working set is a list of k slots, each with a row of the factor of K_WW.
+   The working set is a list of k slots, each with a row of the factor of K_WW. N is the
+   number of variables, r that of rows at a stage, H that of stages (core.c).
    --------------------------------------------------------------------------------- */
 
 enum { BATCHES = 4, ROUNDS = 10, REFINEMENTS = GPMPC_IS_FLOAT ? 6 : 3 };
@@ -108,9 +109,9 @@ static real measure_rows(gpmpc_program *work)
     return undefined == 0 ? 1 / cancelled : 0;
 }
 
-/* Lets constraint p, outside the working set, count as violated again: with a
+/* Lets constraint p, outside the working set, count as violated: with a
    multiplier of zero beyond its bounds, at a cap inside the bound that it violates. */
-static void restore_limits(gpmpc_program *work, int p)
+static void watch(gpmpc_program *work, int p)
 {
     real low = work->lower[p];
     real high = work->upper[p];
@@ -149,14 +150,14 @@ static int read_bounds(gpmpc_program *work)
         work->negligible[p] = work->negligible_length * work->norm[p];
         work->multiplier[p] = 0;
         work->multiplier_low[p] = 0;
-        restore_limits(work, p);
+        watch(work, p);
     }
     return 1;
 }
 
 /* Lets constraint p count as satisfied whatever its value: it is in the working set,
    or cannot be told from one that is. */
-static void ignore_violations(gpmpc_program *work, int p)
+static void stop_watching(gpmpc_program *work, int p)
 {
     work->allowed_low[p] = -INFINITY;
     work->allowed_high[p] = INFINITY;
@@ -245,8 +246,8 @@ static int choose_badly_violated(gpmpc_program *work, real threshold, int count,
             continue;
         bad++;
         if (chosen < most && work->multiplier[p] == 0) {
-            int above = work->value[p] > work->upper[p];
-            work->candidates[chosen++] = above ? p + 1 : -(p + 1);
+            int at_upper = work->value[p] > work->upper[p];
+            work->candidates[chosen++] = at_upper ? p + 1 : -(p + 1);
         }
     }
     return bad > 1 ? chosen : 0;
@@ -282,18 +283,18 @@ static void write_column(const gpmpc_program *work, int p, real *w)
     solve_transposed(&work->L[0][0], N, end, w);
 }
 
-/* Writes constraint p, at its upper (``above``) or lower bound, to slot k. */
-static void write_slot(gpmpc_program *work, int k, int p, int above)
+/* Writes constraint p, at its upper or its lower bound, to slot k. */
+static void write_slot(gpmpc_program *work, int k, int p, int at_upper)
 {
     real *w = work->w[work->place[k]];
     int equality = work->lower[p] == work->upper[p];
     real cap = work->cap[p];
     write_column(work, p, w);
     work->diagonal[k] = dot(w, w, work->row_end[p]);
-    work->label[k] = above ? p + 1 : -(p + 1);
-    work->bound[k] = above ? work->upper[p] : work->lower[p];
-    work->least_multiplier[k] = equality || !above ? -cap : 0;
-    work->most_multiplier[k] = equality || above ? cap : 0;
+    work->label[k] = at_upper ? p + 1 : -(p + 1);
+    work->bound[k] = at_upper ? work->upper[p] : work->lower[p];
+    work->least_multiplier[k] = equality || !at_upper ? -cap : 0;
+    work->most_multiplier[k] = equality || at_upper ? cap : 0;
     work->free_value[k] = dot(w, work->free_rhs, N);
 }
 
@@ -329,7 +330,7 @@ static int add_constraint(gpmpc_program *work, int k, int p, real pivot)
 {
     copy(work->forward, work->factor[k], k);
     work->factor[k][k] = 1 / SQRT(pivot);
-    ignore_violations(work, p);
+    stop_watching(work, p);
     return k + 1;
 }
 
@@ -475,36 +476,36 @@ static int satisfy_constraint(gpmpc_program *work, int *size, int p, int *change
 {
     real *mu = work->multiplier;
     int k = *size;
-    int above;
+    int at_upper;
     real sense, violation;
     if (mu[p] == 0) {
-        above = work->value[p] > work->upper[p];
-        sense = above ? 1 : -1; /* the direction in which mu_p moves */
-    } else { /* it comes back from a cap */
-        above = mu[p] > 0;
-        sense = above ? -1 : 1;
+        at_upper = work->value[p] > work->upper[p];
+        sense = at_upper ? 1 : -1; /* the direction in which mu_p moves */
+    } else { /* it comes back from a cap: p holds, and need not be paid for */
+        at_upper = mu[p] > 0;
+        sense = at_upper ? -1 : 1;
     }
-    write_slot(work, k, p, above);
+    write_slot(work, k, p, at_upper);
     compute_factor_row(work, k, p);
-    violation = sense * (above ? above_bound(work, p) : -below_bound(work, p));
+    violation = sense * (at_upper ? above_bound(work, p) : -below_bound(work, p));
     for (;;) {
         real K_pp = work->diagonal[k];
         real d, step, room, range_end;
-        int capped, blocking, i;
+        int reaches_range_end, blocking, i;
         /* direction: r = K_WW^-1 K_Wp, d = K_pp - K_pW r */
         copy(work->forward, work->direction, k);
         solve_transposed(&work->factor[0][0], GPMPC_SLOTS, k, work->direction);
         d = K_pp - dot(work->forward, work->forward, k);
         if (d < DOUBTFUL_SQUARE * K_pp)
             d = distance_to_span(work, k);
-        /* length: until p holds, its multiplier is at its cap, or one leaves its
-           range */
+        /* length: until p holds, its multiplier is at the end of its range (its cap, or
+           zero on the way back), or a working one is */
         step = d > DEPENDENT_SQUARE * K_pp && k < N ? larger(0, violation) / d
                                                     : INFINITY;
         range_end = sense > 0 ? work->most_multiplier[k] : work->least_multiplier[k];
         room = (range_end - mu[p]) * sense;
-        capped = room < step;
-        if (capped)
+        reaches_range_end = room < step;
+        if (reaches_range_end)
             step = room;
         blocking = first_blocking(work, k, sense, &step);
         if (step > LARGEST) { /* (r, -1) is Farkas' proof, unless rounding violates p */
@@ -521,11 +522,11 @@ static int satisfy_constraint(gpmpc_program *work, int *size, int p, int *change
                                        sense * work->direction[blocking]);
             drop_constraint(work, k, blocking);
             k--;
-            restore_limits(work, leaving);
+            watch(work, leaving);
             violation -= step * d;
-        } else if (capped) { /* a soft row that stays violated */
+        } else if (reaches_range_end) { /* stays violated at its cap, or holds */
             mu[p] = range_end;
-            restore_limits(work, p);
+            watch(work, p);
             *size = k;
             return 1;
         } else { /* full step: add p */
@@ -597,7 +598,7 @@ static int drop_wrong_multipliers(gpmpc_program *work, int k)
         drop_constraint(work, k, slot);
         k--;
         work->multiplier[p] = 0;
-        restore_limits(work, p);
+        watch(work, p);
     }
     for (i = 0; i < k; i++)
         work->multiplier[constraint_in(work, i)] = trial[i];
@@ -675,7 +676,7 @@ static void iterate(gpmpc_program *work, Progress *progress, int starts, int gue
                 /* pass p over: it contradicts the others by rounding */
                 work->multiplier[p] = multiplier_before;
                 work->negligible[p] += ROUNDING_OF_BOUNDS * terms;
-                ignore_violations(work, p);
+                stop_watching(work, p);
                 progress->passed_over = 1;
                 multipliers_fit = work->soft;
             }
@@ -882,7 +883,7 @@ static int start(gpmpc_program *work, const gpmpc_solution *guess)
             real bound = multiplier > 0 ? work->upper[p] : work->lower[p];
             if (absolute(multiplier) >= work->cap[p] && is_finite(bound)) {
                 work->multiplier[p] = multiplier > 0 ? work->cap[p] : -work->cap[p];
-                restore_limits(work, p);
+                watch(work, p);
             }
         }
     add_multipliers(work, 0);

@@ -6,16 +6,16 @@
    of doubled digits.
    --------------------------------------------------------------------------------- */
 
-enum { CORRECTIONS = 12, DEPENDENT_TRIES = 4 };
+enum { CORRECTIONS = 12, DISTANCES = 4 };
 
-enum { OUTSIDE, WORKING, PASSED_OVER }; /* where a constraint is */
+enum { OUTSIDE, WORKING, PASSED_OVER }; /* whether a constraint is in the set */
 
 typedef struct {
     const gpmpc_problem *problem; /* NULL: residuals by P and G */
     real dependent; /* distance from the others, as a share, where rows depend on them */
     int size;       /* k, of the working set */
     int iterations;
-    char place[GPMPC_CONSTRAINTS];
+    char membership[GPMPC_CONSTRAINTS];
     real length[GPMPC_CONSTRAINTS]; /* of the columns */
 } Rescue;
 
@@ -27,6 +27,7 @@ typedef struct {
     real amount;
 } Violation;
 
+/* Writes values and the gradient of the Lagrangian, with doubled digits. */
 static void evaluate(const Rescue *rescue, gpmpc_program *work)
 {
 #if GPMPC_IS_FLOAT
@@ -124,7 +125,7 @@ static void set_multiplier(gpmpc_program *work, int p, real multiplier)
 static void add_working(Rescue *rescue, gpmpc_program *work, int p, int side)
 {
     work->label[rescue->size++] = side * (p + 1);
-    rescue->place[p] = WORKING;
+    rescue->membership[p] = WORKING;
 }
 
 static void drop_working(Rescue *rescue, gpmpc_program *work, int slot, real multiplier)
@@ -132,7 +133,7 @@ static void drop_working(Rescue *rescue, gpmpc_program *work, int slot, real mul
     int p = constraint_in(work, slot);
     int i;
     set_multiplier(work, p, multiplier);
-    rescue->place[p] = OUTSIDE;
+    rescue->membership[p] = OUTSIDE;
     rescue->size--;
     for (i = slot; i < rescue->size; i++)
         work->label[i] = work->label[i + 1];
@@ -147,7 +148,7 @@ static void start_rescue(Rescue *rescue, gpmpc_program *work, int guessed)
     rescue->size = 0;
     rescue->iterations = 0;
     for (i = 0; i < constraint_count(work); i++) {
-        rescue->place[i] = OUTSIDE;
+        rescue->membership[i] = OUTSIDE;
         set_multiplier(work, i, 0);
         work->value[i] = 0;
         work->value_low[i] = 0;
@@ -161,7 +162,7 @@ static void start_rescue(Rescue *rescue, gpmpc_program *work, int guessed)
             int p = constraint_of(label);
             real distance;
             real bound = label > 0 ? work->upper[p] : work->lower[p];
-            if (rescue->place[p] != OUTSIDE || !is_finite(bound)
+            if (rescue->membership[p] != OUTSIDE || !is_finite(bound)
                 || !(rescue->length[p] > 0))
                 continue;
             write_column(work, p, work->w[k]);
@@ -305,7 +306,7 @@ static int find_violation(const Rescue *rescue, gpmpc_program *work,
         real above = is_finite(work->upper[p]) ? above_bound(work, p) : -INFINITY;
         real below = is_finite(work->lower[p]) ? below_bound(work, p) : -INFINITY;
         real excess, terms, share;
-        if (rescue->place[p] != OUTSIDE)
+        if (rescue->membership[p] != OUTSIDE)
             continue;
         excess = larger(above, below);
         if (mu != 0) /* one at a cap must stay outside its bound */
@@ -467,7 +468,7 @@ static int run_rescue(Rescue *rescue, gpmpc_program *work, int limit)
         }
         if (violation.amount > rounding)
             return GPMPC_NUMERICAL_TROUBLE;
-        rescue->place[violation.p] = PASSED_OVER;
+        rescue->membership[violation.p] = PASSED_OVER;
     }
 }
 
@@ -475,7 +476,7 @@ static int run_rescue(Rescue *rescue, gpmpc_program *work, int limit)
 static void rescue_solution(const gpmpc_problem *problem, gpmpc_program *work,
                             gpmpc_solution *solution)
 {
-    static const real dependent[DEPENDENT_TRIES] = DEPENDENT_DISTANCES;
+    static const real dependent[DISTANCES] = DEPENDENT_DISTANCES;
     Progress progress = {GPMPC_NUMERICAL_TROUBLE, 0, 0, 0, 0, 0, 0};
     Rescue rescue;
     int guessed = solution->working;
@@ -488,12 +489,11 @@ static void rescue_solution(const gpmpc_problem *problem, gpmpc_program *work,
         write_column(work, i, work->scratch);
         rescue.length[i] = SQRT(dot(work->scratch, work->scratch, N));
     }
-    for (attempt = 0; attempt < 2 * DEPENDENT_TRIES; attempt++) {
-        rescue.problem = attempt < DEPENDENT_TRIES ? problem : 0;
-        rescue.dependent = dependent[attempt % DEPENDENT_TRIES]
+    /* in float each distance twice: residuals along the dynamics, then by P and G */
+    for (attempt = 0; attempt < (GPMPC_IS_FLOAT ? 2 : 1) * DISTANCES; attempt++) {
+        rescue.problem = attempt < DISTANCES ? problem : 0;
+        rescue.dependent = dependent[attempt % DISTANCES]
                            / SQRT(work->pivot_share);
-        if (!GPMPC_IS_FLOAT && attempt >= DEPENDENT_TRIES)
-            break;
         start_rescue(&rescue, work, guessed);
         progress.status =
             run_rescue(&rescue, work, progress.limit - progress.iterations);

@@ -102,7 +102,7 @@ class CvxpySolver:
         has_start = False
         if isinstance(warm_start, QPSolution) and len(warm_start.x) == len(problem.q):
             has_start = True
-            compiled.y.value = transform.factor @ (warm_start.x - transform.free)
+            compiled.y.value = transform.upper_factor @ (warm_start.x - transform.free)
         built = perf_counter()
         choices = [self.options]
         if self.options is None:  # the solver's own, and tight ones before
@@ -166,18 +166,18 @@ class _Compiled(NamedTuple):
 class _Transform(NamedTuple):
     """The change of variables x = free + back y."""
 
-    factor: Array  # (n, n) L' with P = L L' (in the kernels P = L'L)
+    upper_factor: Array  # (n, n) L' with P = L L' (in the kernels P = L'L)
     back: Array  # (n, n) L^-T
     free: Array  # (n,) the free minimiser
 
     @classmethod
     def of(cls, problem: QuadraticProgram) -> "_Transform":
         """Returns the transform of a problem."""
-        factor = np.asarray(np.linalg.cholesky(problem.P), dtype=np.float64).T
+        upper_factor = np.asarray(np.linalg.cholesky(problem.P), dtype=np.float64).T
         return cls(
-            factor=factor,
-            back=solve_triangular(factor, np.eye(len(factor))),
-            free=-cho_solve((factor, False), problem.q),
+            upper_factor=upper_factor,
+            back=solve_triangular(upper_factor, np.eye(len(upper_factor))),
+            free=-cho_solve((upper_factor, False), problem.q),
         )
 
     def write_parameters(self, compiled: _Compiled, problem: QuadraticProgram) -> None:

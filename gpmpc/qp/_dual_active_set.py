@@ -254,8 +254,7 @@ class DualActiveSet:
             status = solve_kernel(*problem, guess, memory, record)
         else:
             problem = _for_kernel(problem)
-        # From here on ``status`` is what the kernel returned last. The record's own may
-        # say more: that time is up.
+        kernel_status = status  # the record's may say more: that time is up
 
         def late() -> bool:
             if self.time_limit is None:
@@ -264,15 +263,19 @@ class DualActiveSet:
 
         limit = self._limit(len(problem.lower))
         iterations = record[layout.ITERATIONS]
-        while status == layout.ITERATION_LIMIT and not late() and iterations < limit:
+        while (
+            kernel_status == layout.ITERATION_LIMIT
+            and not late()
+            and iterations < limit
+        ):
             guess = record  # the kernel stopped to have the clock looked at
             record = np.empty_like(record)
-            status = solve_kernel(*problem, guess, memory, record)
+            kernel_status = solve_kernel(*problem, guess, memory, record)
             iterations += record[layout.ITERATIONS]
         record[layout.ITERATIONS] = iterations
-        if status == layout.ITERATION_LIMIT and late():
+        is_at_limit = kernel_status == layout.ITERATION_LIMIT
+        if is_at_limit and late():
             record[layout.STATUS] = layout.TIME_LIMIT
-        is_at_limit = status == layout.ITERATION_LIMIT
         is_at_own_limit = is_at_limit and self.iteration_limit is not None
         if is_at_own_limit or _is_final(record, problem, caps):
             return problem, record

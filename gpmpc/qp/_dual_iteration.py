@@ -32,11 +32,11 @@ from gpmpc.qp._triangular import (
 )
 from gpmpc.qp._violations import (
     choose_badly_violated,
-    ignore_violations,
     list_violated,
     most_violated,
     recheck_violated,
-    restore_limits,
+    stop_watching,
+    watch,
 )
 from gpmpc.qp._working_set import (
     add_candidates,
@@ -131,12 +131,11 @@ def iterate(
                 status = INFEASIBLE
                 break
             passed_over = passed_over or entry.passed_over
-            # with soft rows ``free_value`` is that of before x_u moved: there
-            # refinement corrects the multipliers
+            # A soft row that comes to its cap moves x_u, and ``free_value`` stays that
+            # of before. From then on there are single steps only, and refinement
+            # corrects the multipliers
             must_solve_multipliers = entry.passed_over and work.soft == 0.0
-            if work.soft != 0.0:
-                # p may have reached its cap, which moves x_u; several at once need
-                # the ``free_value`` of before
+            if work.soft != 0.0:  # p may have come to its cap
                 batches_left = 0
         elif not is_first_look:
             iterations += k - size_before
@@ -147,9 +146,9 @@ def iterate(
         _minimise(work, k)
 
         # first satisfy the others that were seen to be violated, then look at all
-        was_last_listed = violated_count == 1
+        only_p_was_listed = violated_count == 1
         is_last_look = iterations >= work.limit
-        looks_at_all = was_last_listed or work.soft != 0.0 or is_last_look
+        looks_at_all = only_p_was_listed or work.soft != 0.0 or is_last_look
         all_listed = looks_at_all or not single
         if not all_listed:
             violated_count = recheck_violated(work, margin, violated_count)
@@ -199,7 +198,7 @@ def _enter(work, k, p):
             # what p gained on the way belongs to no working set
             work.multiplier[p] = multiplier_before
             work.negligible[p] += _ROUNDING_OF_BOUNDS * terms
-            ignore_violations(work, p)
+            stop_watching(work, p)
     return _Entry(
         size=k,
         changes=attempt.changes,
@@ -225,12 +224,12 @@ def _satisfy_constraint(work, k, p):
     mu = work.multiplier
     r = work.direction
     if mu[p] == 0.0:
-        above = work.value[p] > work.upper[p]
-        sense = 1.0 if above else -1.0  # the direction in which mu_p moves
-    else:  # it comes back from a cap
-        above = mu[p] > 0.0
-        sense = -1.0 if above else 1.0
-    write_slot(work, k, p, above)
+        at_upper = work.value[p] > work.upper[p]
+        sense = 1.0 if at_upper else -1.0  # the direction in which mu_p moves
+    else:  # it comes back from a cap: p holds, and need not be paid for
+        at_upper = mu[p] > 0.0
+        sense = -1.0 if at_upper else 1.0
+    write_slot(work, k, p, at_upper)
     compute_factor_row(work, k, p)
     violation = (work.value[p] - work.bound[k]) * sense
     K_pp = work.diagonal[k]
@@ -245,13 +244,14 @@ def _satisfy_constraint(work, k, p):
             d = distance_to_span(work, k)
 
         # step length: t2 = violation / d makes p hold, at ``room`` its multiplier
-        # reaches its cap, at t1 a working one reaches the end of its range
+        # reaches the end of its range (its cap, or zero on the way back), at t1 a
+        # working one does
         independent = d > _DEPENDENT_SQUARE * K_pp and k < work.n
         step = max(0.0, violation) / d if independent else np.inf
         range_end = work.most_multiplier[k] if sense > 0.0 else work.least_multiplier[k]
         room = (range_end - mu[p]) * sense
-        capped = room < step
-        if capped:
+        reaches_range_end = room < step
+        if reaches_range_end:
             step = room
         step, blocking = _first_blocking(work, k, sense, step)
         if step == np.inf:  # (r, -1) is Farkas' proof, unless rounding violates p
@@ -267,13 +267,12 @@ def _satisfy_constraint(work, k, p):
             mu[leaving] = _end_of_range(work, blocking, sense * r[blocking])
             drop_constraint(work, k, blocking)
             k -= 1
-            restore_limits(work, leaving)
+            watch(work, leaving)
             violation -= step * d
-        elif capped:
-            # mu_p is at an end of its range: p stays outside the working set, violated
-            # at its cap or satisfied at zero
+        elif reaches_range_end:
+            # p stays outside the working set, violated at its cap or satisfied at zero
             mu[p] = range_end
-            restore_limits(work, p)
+            watch(work, p)
             return _Attempt(contradicts=False, size=k, changes=changes)
         else:  # full step: add p
             k = add_constraint(work, k, p, d)
@@ -380,7 +379,7 @@ def _drop_wrong_multipliers(work, k):
         drop_constraint(work, k, slot)
         k -= 1
         work.multiplier[p] = 0.0
-        restore_limits(work, p)
+        watch(work, p)
     for i in range(k):
         work.multiplier[constraint_in(work, i)] = trial[i]
     return k
@@ -413,7 +412,7 @@ def _minimise(work, k):
         scale(1.0, work.free_rhs, x, n)
         for i in range(k):
             work.scratch[i] = work.multiplier[constraint_in(work, i)]
-        subtract_rows(x, work.rows, work.place, work.scratch, k, n)
+        subtract_rows(x, work.w, work.place, work.scratch, k, n)
         solve_lower(work.L, n, x)
 
 

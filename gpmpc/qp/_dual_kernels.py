@@ -51,7 +51,7 @@ from gpmpc.qp._violations import (
     TOLERATED,
     choose_guessed,
     list_violated,
-    restore_limits,
+    watch,
 )
 from gpmpc.qp._working_set import constraint_in, is_prepared, restore_working_set
 from gpmpc.qp._workspace_type import open_workspace
@@ -67,7 +67,7 @@ SIGNATURE = (
 # violation of a bound of zero by as little: see ``negligible_length`` and
 # ``negligible`` in ``gpmpc.qp._workspace``.
 NEGLIGIBLE = 1e-26
-_LARGEST_BOUND = np.nextafter(ABSENT, 0.0)
+_LARGEST_BOUND = np.nextafter(ABSENT, 0.0)  # the last float below ``ABSENT``
 # A constraint that depends on others may be left with this violation: see
 # ``worst_violation``.
 _TOLERATED_IF_DEPENDENT = 2e-14
@@ -171,7 +171,7 @@ def _measure_rows(work):
     """
     n = work.n
     units = work.scratch
-    cancelled = 1.0
+    cancelled = 1.0  # the largest P_ii over its pivot, which is 1 / L_ii^2
     undefined = 0.0
     store(units, n // 8 * 8, zeros())
     for i in range(n):
@@ -263,6 +263,7 @@ def _solve_opened(work, guess, out):
     fine = min(_FINE, work.tolerance)
     margin = _FIRST_MARGIN * work.length_of_q  # small violations wait for the refined x
     first_round = True
+    must_iterate = True  # else a round refines x only
     rounds = 0
     count = 0  # of the listed violated constraints
     finest = False  # whether x is to be as good as can be
@@ -271,7 +272,7 @@ def _solve_opened(work, guess, out):
     status = NUMERICAL_TROUBLE
     while True:
         # iterate until no constraint is violated by more than the margin
-        if first_round or count > 0:
+        if must_iterate:
             progress = iterate(
                 work, k, first_round, guessed, count, margin, iterations, batches_left
             )
@@ -289,6 +290,8 @@ def _solve_opened(work, guess, out):
         # ends here if nothing changed since violations were listed at a margin of zero.
         # Written out: a function that returns all this costs 9 s of compilation
         _put_on_bounds(work, k)
+        # an error of mu is magnified by K_WW = W W', but reaches x through W' alone: by
+        # the root of that
         pivot_share = min(work.pivot_share, math.sqrt(_least_pivot_share(work, k)))
         finest = finest or passed_over or pivot_share < _ILL_CONDITIONED_SHARE
         largest_residual = _RESIDUAL_PER_PIVOT_SHARE * pivot_share
@@ -301,18 +304,16 @@ def _solve_opened(work, guess, out):
         if settled or rounds == _ROUNDS or refined.residual >= UNDEFINED:
             break
         margin = 0.0
-        changed = False
 
         # list what the refined x violates. Before x is as good as can be its error may
         # hide a violation: rows that hold by less than the error are listed, too
         error = refined.residual * refined.length / pivot_share
-        count = list_violated(work, -0.0 if finest else -error)
+        count = list_violated(work, 0.0 if finest else -error)
         if count == 0:
             break
-        if not finest:  # refine once more before these are believed
-            finest = True
-            count = 0
-            changed = True
+        must_iterate = finest  # else x is refined once more before these are believed
+        changed = not finest
+        finest = True
     unsure = passed_over or rounds == _ROUNDS  # of the violations that are left
     if unsure and status == SOLVED and worst_violation(work) > _TOLERATED_IF_DEPENDENT:
         status = NUMERICAL_TROUBLE
@@ -335,7 +336,7 @@ def _start(work, guess, record_size):
         _start_at_caps(work, guess)
     # for a literal number numba would compile the function once more
     add_multipliers(work, np.int64(0))
-    scale(-1.0, work.slope, work.free_rhs, n)
+    scale(-1.0, work.slope, work.free_rhs, n)  # which is all if prepared
     if not is_prepared(work):
         solve_transposed(work.L, n, work.free_rhs)
     k = 0
@@ -368,7 +369,7 @@ def _start_at_caps(work, guess):
         bound = work.upper[p] if multiplier > 0.0 else work.lower[p]
         if abs(multiplier) >= cap and abs(bound) < np.inf:
             work.multiplier[p] = cap if multiplier > 0.0 else -cap
-            restore_limits(work, p)
+            watch(work, p)
 
 
 @inline_njit

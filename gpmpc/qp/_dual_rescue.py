@@ -339,7 +339,9 @@ class _AccurateSolver:
         above = above - NEGLIGIBLE * np.abs(self.upper)
         below = np.where(np.isfinite(self.lower), self.lower - y, -np.inf)
         below = below - NEGLIGIBLE * np.abs(self.lower)
-        # one at a cap must stay outside its bound: it is violated where it is not
+        # One at a cap must stay outside its bound: it is violated where it is not. The
+        # rounding that ``above`` lost then counts the other way, and is less than what
+        # is taken off below
         excess = np.maximum(above, below)
         excess = np.where(mu < 0.0, -below, excess)
         excess = np.where(mu > 0.0, -above, excess)
@@ -445,7 +447,8 @@ class _AccurateSolver:
     def _prove(self, violated: _Violated, combination: Array) -> bool:
         """Returns whether a contradiction has Farkas' proof, which becomes the ray.
 
-        ``combination`` is that of working constraints which the violated one is.
+        ``combination`` is that of working constraints which the violated one is. What
+        may be violated for a price has no weight in a proof.
         """
         p = violated.p
         sense = violated.sense

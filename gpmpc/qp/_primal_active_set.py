@@ -73,7 +73,7 @@ class _Rows(NamedTuple):
     h: Array  # (r,)
     equality: NDArray[np.bool_]  # (r,)
     stacked: NDArray[np.intp]  # (r,) which stacked constraint [x; Gx] it is,
-    factor: Array  # (r,) and by what that constraint was multiplied
+    scale: Array  # (r,) and by what that constraint was multiplied
 
 
 class _Outcome(NamedTuple):
@@ -151,7 +151,7 @@ class PrimalActiveSet:
                 if not working or droppable.min() >= 0.0:
                     stacked = _stack(rows, working, multipliers, len(problem.lower))
                     active = np.zeros(len(problem.lower))
-                    active[rows.stacked[working]] = np.sign(rows.factor[working])
+                    active[rows.stacked[working]] = np.sign(rows.scale[working])
                     return _Outcome(Status.SOLVED, x, iteration, stacked, active)
                 leaving = np.argmin(droppable)
                 if zero_steps > _ZERO_STEPS:  # Bland's rule
@@ -206,7 +206,7 @@ def _read_warm_start(record: Array, problem: QuadraticProgram) -> tuple[Array, A
 
 def _guessed_rows(rows: _Rows, x: Array, labels: Array) -> list[int]:
     """Returns equalities and the labelled rows that hold with equality at x."""
-    guessed = np.isin((rows.stacked + 1) * np.sign(rows.factor), labels)
+    guessed = np.isin((rows.stacked + 1) * np.sign(rows.scale), labels)
     distance = np.abs(rows.A @ x - rows.h)
     tight = distance <= _INSIDE * np.maximum(1.0, np.abs(rows.h))
     return list(np.flatnonzero(rows.equality | (guessed & tight)))
@@ -225,11 +225,11 @@ def _one_sided(problem: QuadraticProgram) -> _Rows:
     below = np.flatnonzero((lower > -ABSENT) & ~equal)
     stacked = np.concatenate([above, below])
     norms = np.linalg.norm(C, axis=1)[stacked]
-    factor = np.repeat([1.0, -1.0], [len(above), len(below)]) / np.where(
+    scale = np.repeat([1.0, -1.0], [len(above), len(below)]) / np.where(
         norms > 0.0, norms, 1.0
     )
-    h = np.concatenate([upper[above], lower[below]]) * factor
-    return _Rows(C[stacked] * factor[:, None], h, equal[stacked], stacked, factor)
+    h = np.concatenate([upper[above], lower[below]]) * scale
+    return _Rows(C[stacked] * scale[:, None], h, equal[stacked], stacked, scale)
 
 
 def _phase_1(rows: _Rows, start: Array, M: int) -> tuple[Array, Array | None]:
@@ -319,5 +319,5 @@ def _step_length(
 def _stack(rows: _Rows, which, multipliers: Array, M: int) -> Array:
     """Returns multipliers (M,) of stacked constraints from those of one-sided rows."""
     stacked = np.zeros(M)
-    np.add.at(stacked, rows.stacked[which], multipliers * rows.factor[which])
+    np.add.at(stacked, rows.stacked[which], multipliers * rows.scale[which])
     return stacked

@@ -11,7 +11,8 @@ is exact: a row whose multiplier stays below its price is kept (Fletcher, 1987, 
 14.3).
 
 Solvers see the constraints *stacked*, box first: ``lower <= C x <= upper`` with C = [I;
-G], M = n + m rows.
+G], M = n + m rows. Kernels and exported C factorise P = L'L, where rows that end early
+stay short; doubled digits and ``CvxpySolver`` take P = L L'.
 """
 
 from typing import NamedTuple

@@ -30,7 +30,8 @@ from gpmpc.qp._triangular import (
 )
 from gpmpc.qp._working_set import constraint_in
 
-# A residual that overflowed: less than infinity, so that refinement is tried.
+# A residual that overflowed. It is less than half of infinity, so that ``refine`` takes
+# a step all the same; what is as large after that ends the solve (``_solve_opened``).
 UNDEFINED = 1e300
 _STEPS = 3
 _TINY = 1e-300
@@ -140,7 +141,7 @@ def _take_newton_step(work, k):
     solve_transposed(work.L, n, transformed)
 
     dmu = work.direction  # K_WW^-1 (residual - W transformed)
-    multiply_rows(work.rows, work.place, k, transformed, n, dmu)
+    multiply_rows(work.w, work.place, k, transformed, n, dmu)
     for i in range(0, k, 8):
         store(dmu, i, load(work.residual, i) - load(dmu, i))
     solve_lower(work.factor, k, dmu)
@@ -148,7 +149,7 @@ def _take_newton_step(work, k):
 
     dx = work.gradient  # -L^-1 (transformed + sum dmu_i w_i)
     scale(-1.0, transformed, dx, n)
-    subtract_rows(dx, work.rows, work.place, dmu, k, n)
+    subtract_rows(dx, work.w, work.place, dmu, k, n)
     solve_lower(work.L, n, dx)
 
     for j in range(0, n, 8):
@@ -174,11 +175,14 @@ def worst_violation(work):
         above = work.value[p] - work.upper[p]
         below = work.lower[p] - work.value[p]
         multiplier = work.multiplier[p]
-        is_at_cap = abs(multiplier) >= work.cap[p]
-        at_upper = multiplier > 0.0 if is_at_cap else above > below
-        outside = above if at_upper else below
-        violation = -outside if is_at_cap else outside
+        if abs(multiplier) >= work.cap[p]:
+            at_upper = multiplier > 0.0
+            violation = -above if at_upper else -below
+        else:
+            at_upper = above > below
+            violation = above if at_upper else below
         bound = work.upper[p] if at_upper else work.lower[p]
         size = max(1e-3 * length * work.norm[p], abs(bound))
+        # NaN without bounds, which ``max`` passes over as its second argument
         worst = max(worst, (violation - work.negligible[p]) / size)
     return worst

@@ -144,29 +144,29 @@ class QPSolution(NamedTuple):
         units = np.sqrt(np.diagonal(P))
         length_of_q = (np.abs(q) / units).max()
         length_of_x = (units * np.abs(self.x)).max()
-        zero = max(1e-4 * length_of_x, zero * length_of_q)
+        zero_length = max(1e-4 * length_of_x, zero * length_of_q)
         violation = self.violation()
         return Residuals(
-            primal=self._primal_residual(violation, zero / units),
-            dual=self._dual_residual(zero * units),
-            gap=self._gap(violation, zero * length_of_q),
+            primal=self._primal_residual(violation, zero_length / units),
+            dual=self._dual_residual(zero_length * units),
+            gap=self._gap(violation, zero_length * length_of_q),
         )
 
-    def _primal_residual(self, violation: Array, zero: Array) -> float:
-        """Returns ``Residuals.primal``; an x_j below ``zero`` (n,) counts as that."""
+    def _primal_residual(self, violation: Array, zero_entries: Array) -> float:
+        """Returns ``Residuals.primal``; an x_j below ``zero_entries`` is that."""
         _, _, G, lower, upper = self.arrays
         x = self.x
         n = len(x)
         unpaid = np.where(np.abs(self.multipliers) >= self.caps, 0.0, violation)
         violates_upper = np.concatenate([x, G @ x]) > upper
         bound = np.abs(np.where(violates_upper, upper, lower))
-        entries = np.maximum(np.abs(x), zero)
+        entries = np.maximum(np.abs(x), zero_entries)
         terms = np.concatenate([entries, np.abs(G) @ entries])
         terms[n:][~G.any(axis=1)] = zero_row_size(G, lower, upper)
         return _largest_ratio(unpaid, np.maximum(terms, bound))
 
-    def _dual_residual(self, zero: Array) -> float:
-        """Returns ``Residuals.dual``; terms below ``zero`` (n,) count as that."""
+    def _dual_residual(self, zero_terms: Array) -> float:
+        """Returns ``Residuals.dual``; terms below ``zero_terms`` (n,) count as that."""
         P, q, G, lower, upper = self.arrays
         x = self.x
         n = len(x)
@@ -179,10 +179,10 @@ class QPSolution(NamedTuple):
         stationarity = np.abs(P @ x + q + G.T @ self.z + self.z_box)
         residual = stationarity + wrong[:n] + np.abs(G).T @ wrong[n:]
         terms = np.abs(P) @ np.abs(x) + np.abs(q) + right[:n] + np.abs(G).T @ right[n:]
-        return _largest_ratio(residual, np.maximum(terms, zero))
+        return _largest_ratio(residual, np.maximum(terms, zero_terms))
 
-    def _gap(self, violation: Array, zero: float) -> float:
-        """Returns ``Residuals.gap``; objectives below ``zero`` count as that."""
+    def _gap(self, violation: Array, zero_objective: float) -> float:
+        """Returns ``Residuals.gap``; less than ``zero_objective`` counts as that."""
         P, q, _, lower, upper = self.arrays
         x = self.x
         multipliers = self.multipliers
@@ -197,7 +197,8 @@ class QPSolution(NamedTuple):
         linear = q @ x
         gap = abs(quadratic + linear + (at_upper.sum() + at_lower.sum()) + price)
         bounds_terms = np.abs(at_upper).sum() + np.abs(at_lower).sum()
-        return _largest_ratio(gap, max(abs(quadratic), abs(linear), bounds_terms, zero))
+        terms = max(abs(quadratic), abs(linear), bounds_terms, zero_objective)
+        return _largest_ratio(gap, terms)
 
     def is_optimal(self, eps: float = 1e-9) -> bool:
         """Whether the residuals, whatever the status says, are all at most ``eps``."""

@@ -10,11 +10,11 @@ TOLERATED = 2e-14
 
 
 @inline_njit
-def restore_limits(work, p):
-    """Lets constraint p, outside the working set, count as violated again.
+def watch(work, p):
+    """Lets constraint p, outside the working set, count as violated.
 
     With a multiplier of zero it must stay within its bounds. At a cap it must stay
-    outside the bound that it violates.
+    outside the bound that it violates, so the allowed side is the one beyond that.
     """
     low = work.lower[p]
     high = work.upper[p]
@@ -32,7 +32,7 @@ def restore_limits(work, p):
 
 
 @inline_njit
-def ignore_violations(work, p):
+def stop_watching(work, p):
     """Lets constraint p count as satisfied whatever its value.
 
     It is in the working set, or cannot be told from one that is.
@@ -60,7 +60,7 @@ def list_violated(work, margin):
     excess = work.excess
     violated = work.violated
     count = 0
-    for p in range(work.M):
+    for p in range(work.M):  # in the unit of the constraint: most lists are empty
         excess[p] = max(value[p] - high[p], low[p] - value[p]) - margin * norm[p]
         count += excess[p] > 0.0
     if count > 0:
@@ -77,7 +77,7 @@ def list_violated(work, margin):
 def recheck_violated(work, margin, count):
     """Computes the listed constraints at the present x; keeps those still violated.
 
-    Returns how many they are.
+    Returns how many they are. ``excess`` is in units of ``norm``, as is ``margin``.
     """
     value = work.value
     excess = work.excess
@@ -113,7 +113,8 @@ def choose_badly_violated(work, threshold, count, most):
     """Makes candidates of the listed constraints with an excess above ``threshold``.
 
     Those at a cap are left out. Returns how many candidates there are, at most
-    ``most``; none where only one constraint is violated that badly.
+    ``most``; none where only one constraint is violated that badly, as a single step
+    can also find that it contradicts the others.
     """
     chosen = 0
     bad = 0
@@ -122,8 +123,8 @@ def choose_badly_violated(work, threshold, count, most):
         if work.excess[p] > threshold:
             bad += 1
             if chosen < most and work.multiplier[p] == 0.0:
-                above = work.value[p] > work.upper[p]
-                work.candidates[chosen] = p + 1 if above else -(p + 1)
+                at_upper = work.value[p] > work.upper[p]
+                work.candidates[chosen] = p + 1 if at_upper else -(p + 1)
                 chosen += 1
     return chosen if bad > 1 else 0
 

@@ -16,7 +16,7 @@ from gpmpc.qp._triangular import (
     solve_transposed,
     subtract_rows,
 )
-from gpmpc.qp._violations import ignore_violations, is_watched
+from gpmpc.qp._violations import is_watched, stop_watching
 
 # A candidate depends on the working constraints if less than this share of K_pp is
 # left.
@@ -25,7 +25,7 @@ _CANDIDATE_PIVOT = 1e-9
 
 @inline_njit
 def is_prepared(work):
-    """Returns whether the memory holds the factor, the rows w_p and K beforehand."""
+    """Returns whether the memory holds the factor, all w_p and K beforehand."""
     return work.tag != 0.0
 
 
@@ -36,14 +36,14 @@ def constraint_in(work, slot):
 
 
 @inline_njit
-def write_slot(work, k, p, above):
-    """Writes constraint p, at its upper (``above``) or lower bound, to slot k."""
+def write_slot(work, k, p, at_upper):
+    """Writes constraint p, at its upper or its lower bound, to slot k."""
     if is_prepared(work):
-        work.place[k] = p
+        work.place[k] = p  # prepared memory has w by constraint
         row = work.K[p]  # begins with c_p'P^-1, as ``free_rhs`` is -q
         work.diagonal[k] = row[p]
     else:
-        row = work.rows[work.place[k]]
+        row = work.w[work.place[k]]
         end = int(work.row_end[p])
         _write_constraint(work, p, row)
         solve_transposed(work.L, end, row)  # w_p = L^-T c_p
@@ -52,10 +52,10 @@ def write_slot(work, k, p, above):
     high = work.upper[p]
     cap = work.cap[p]
     equality = low == high
-    work.label[k] = p + 1 if above else -(p + 1)
-    work.bound[k] = high if above else low
-    work.least_multiplier[k] = -cap if equality or not above else 0.0
-    work.most_multiplier[k] = cap if equality or above else 0.0
+    work.label[k] = p + 1 if at_upper else -(p + 1)
+    work.bound[k] = high if at_upper else low
+    work.least_multiplier[k] = -cap if equality or not at_upper else 0.0
+    work.most_multiplier[k] = cap if equality or at_upper else 0.0
     work.free_value[k] = dot(row, work.free_rhs, work.n)
 
 
@@ -82,8 +82,8 @@ def compute_factor_row(work, k, p):
         for i in range(k):
             forward[i] = column[place[i]]
     else:
-        row = work.rows[place[k]]
-        multiply_rows(work.rows, place, k, row, int(work.row_end[p]), forward)
+        row = work.w[place[k]]
+        multiply_rows(work.w, place, k, row, int(work.row_end[p]), forward)
     solve_lower(work.factor, k, forward)
 
 
@@ -95,8 +95,8 @@ def distance_to_span(work, k):
     """
     n = work.n
     difference = work.scratch
-    scale(1.0, work.rows[work.place[k]], difference, n)
-    subtract_rows(difference, work.rows, work.place, work.direction, k, n)
+    scale(1.0, work.w[work.place[k]], difference, n)
+    subtract_rows(difference, work.w, work.place, work.direction, k, n)
     return dot(difference, difference, n)
 
 
@@ -107,7 +107,7 @@ def add_constraint(work, k, p, pivot):
     ``pivot = K_pp - |forward|^2 > 0``. Returns the size of the working set.
     """
     append_row(work.factor, k, work.forward, pivot)
-    ignore_violations(work, p)
+    stop_watching(work, p)
     return k + 1
 
 
@@ -140,7 +140,7 @@ def restore_working_set(work, count, packed_factor):
         label = work.candidates[i]
         p = abs(label) - 1
         write_slot(work, i, p, label > 0)
-        ignore_violations(work, p)
+        stop_watching(work, p)
         scale(1.0, packed_factor[start:], work.factor[i], i + 1)
         start += i + 1
 
@@ -149,7 +149,7 @@ def restore_working_set(work, count, packed_factor):
 def drop_constraint(work, k, slot):
     """Drops the constraint in a slot; those behind it, up to slot k, go one slot down.
 
-    Its entry of ``forward`` goes too. Its place in ``rows`` becomes that of slot k.
+    Its entry of ``forward`` goes too. Its place in ``w`` becomes that of slot k.
     """
     delete_row(work.factor, k, slot, work.forward, work.cosines, work.sines)
     free_place = work.place[slot]

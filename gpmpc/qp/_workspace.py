@@ -9,7 +9,7 @@ place of x in a record it is the program's *workplace* (``_dual_active_set``). T
 may share it, since a solve keeps the interpreter's lock. The rows of memory, all padded
 to the same length, are
 
-    settings (1) | vectors (25) | integer vectors (4) | L | factor | rows | K
+    settings (1) | vectors (25) | integer vectors (4) | L | factor | w | K
 
 In compiled code ``work = open_workspace(P, q, G, memory)`` has a field for each of
 them: ``work.lower[p]``, ``work.factor[k]``, ``work.tolerance``. To add a vector, add
@@ -18,7 +18,7 @@ would be, and a field becomes an array where it is read. A named tuple of these 
 would hand seven numbers per array to every function, which doubles the time that
 compilation takes (``gpmpc.qp._workspace_type``).
 
-A constraint p is represented by its *row* w_p = L^-T c_p with P = L'L, so that K_pq =
+A constraint p is represented by the vector w_p = L^-T c_p with P = L'L, so that K_pq =
 c_p'P^-1 c_q = w_p . w_q. The *working set* W is a list of k *slots*: slot i holds one
 constraint at one of its bounds, and row i of the factor of K_WW. Its *label* is p + 1
 at the upper bound and -(p + 1) at the lower one.
@@ -61,7 +61,8 @@ VECTORS = (
     "value",  # C x; the first n are the point x
     "excess",  # violation in units of ``norm``
     # By variable j < n.
-    "free_rhs",  # L x = free_rhs without working constraints (-q if prepared)
+    "free_rhs",  # L x = free_rhs without working constraints; if prepared, where
+    # K takes the place of L, it is -q
     "slope",  # q + C' multiplier
     "gradient",  # P x + q + C' multiplier
     "scratch",
@@ -80,7 +81,7 @@ VECTORS = (
 
 INTEGER_VECTORS = (
     "label",  # by slot: of the constraint, see above
-    "place",  # by slot: where w_p is in ``rows``; from slot k on: which are free
+    "place",  # by slot: which row of ``w`` is w_p; from slot k on: which are free
     "violated",  # constraints with an excess
     "candidates",  # labels of constraints to be added
 )
@@ -90,10 +91,8 @@ MATRICES = {
     "G": ("m", "n"),
     "L": ("n", "width"),  # P = L'L, with reciprocals on the diagonal
     "factor": ("slots", "width"),  # L_K of K_WW = L_K L_K', likewise
-    "rows": (
-        "M",
-        "width",
-    ),  # w_p by place; by constraint if prepared. See ``FirstRows``
+    # w_p by place, in prepared memory of all p, whose place is p; see ``FirstRows``
+    "w": ("M", "width"),
     "K": ("M", "width"),  # C P^-1 C', if prepared
 }
 
@@ -113,7 +112,7 @@ class FirstRows(NamedTuple):
 
     L: int
     factor: int
-    rows: int  # M and one: n + 1 slots need as many places, where m is zero, too
+    w: int  # M and one: n + 1 slots need as many places, where m is zero, too
     K: int  # the end of memory that is not prepared
 
 
@@ -122,8 +121,8 @@ def first_rows(n, m):
     """Returns where the matrices begin in memory for n variables and m rows of G."""
     L = _FIRST_MATRIX
     factor = L + n
-    rows = factor + n + 1
-    return FirstRows(L=L, factor=factor, rows=rows, K=rows + n + m + 1)
+    w = factor + n + 1
+    return FirstRows(L=L, factor=factor, w=w, K=w + n + m + 1)
 
 
 def new_memory(
@@ -156,7 +155,7 @@ def with_limit(memory: Array, limit: float) -> Array:
 def prepare_memory(memory: Array, G: Array) -> None:
     """Completes prepared memory in which a solve has left the factor of P.
 
-    Writes the rows w_p, K = C P^-1 C' and the tag.
+    Writes all w_p, K = C P^-1 C' and the tag.
     """
     m, n = G.shape
     M = n + m
@@ -165,8 +164,7 @@ def prepare_memory(memory: Array, G: Array) -> None:
     np.fill_diagonal(L, 1.0 / np.diagonal(L))
     C = np.vstack([np.eye(n), G])
     w = solve_triangular(L, C.T, lower=True, trans="T", check_finite=False).T
-    rows = memory[first.rows :]
     K = memory[first.K :]
-    rows[:M, :n] = w
+    memory[first.w :][:M, :n] = w
     K[:M, :M] = w @ w.T
     memory[0, _TAG] = 1.0 + zlib.crc32(w.tobytes())

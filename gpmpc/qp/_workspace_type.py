@@ -49,10 +49,10 @@ def open_workspace(P, q, G, memory):
     first = first_rows(len(q), len(G))
     L = memory[first.L :]
     factor = memory[first.factor :]
-    rows = memory[first.rows :]
+    w = memory[first.w :]
     K = memory[first.K :]
     # numba passes the first argument
-    return _workspace(P, q, G, memory, L, factor, rows, K)  # pyright: ignore
+    return _workspace(P, q, G, memory, L, factor, w, K)  # pyright: ignore
 
 
 class _WorkspaceType(types.Type):
@@ -83,11 +83,11 @@ class _WorkspaceModel(models.StructModel):
 
 
 @intrinsic
-def _workspace(typing_context, P, q, G, memory, L, factor, rows, K):
+def _workspace(typing_context, P, q, G, memory, L, factor, w, K):
     """Returns the pointers and sizes of these arrays as a workspace."""
 
     def generate(context, builder, signature, arguments):
-        names = ("P", "q", "G", "memory", "L", "factor", "rows", "K")
+        names = ("P", "q", "G", "memory", "L", "factor", "w", "K")
         arrays = {
             name: context.make_array(kind)(context, builder, argument)
             for name, kind, argument in zip(
@@ -103,7 +103,7 @@ def _workspace(typing_context, P, q, G, memory, L, factor, rows, K):
         work.width = builder.extract_value(arrays["memory"].shape, 1)
         return work._getvalue()
 
-    return _WORKSPACE(P, q, G, memory, L, factor, rows, K), generate
+    return _WORKSPACE(P, q, G, memory, L, factor, w, K), generate
 
 
 @infer_getattr
