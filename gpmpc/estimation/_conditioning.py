@@ -130,6 +130,7 @@ def condition(root: Tensor, H_root: Tensor, noise: Tensor) -> Conditioned:
     root = root.expand(*batch, n, n)
     noise_root, info = torch.linalg.cholesky_ex(noise)
     deviations = noise_root.diagonal(dim1=-2, dim2=-1)
+    # One sensor alone has no other to contradict.
     nearly_perfect = (p > 1) & (deviations <= _PERFECT * H_root.norm(dim=-1))
     if bool((info > 0).any() | nearly_perfect.any()):
         return _one_by_one(root, H_root, noise)

@@ -341,7 +341,7 @@ def _rows_and_points(trained: "_TrainedGP", errors: Tensor) -> Tensor:
     inverse = torch.linalg.pinv(trained.effect)
     deviations = trained.noise.sqrt()
     of_rows = to_array((inverse @ errors[..., None])[..., 0] / deviations)
-    # (N, k, k), by which the errors of points show in those of a row.
+    # B^+ B / sd (N, k, k): a row with effect B shows no more of a point's errors.
     visible = to_array(inverse @ trained.effect / deviations[:, None])
     of_points = to_array(trained.errors_of_points)
     scale = gp.features.abs().amax(dim=0).clamp_min(_SMALLEST_SCALE)

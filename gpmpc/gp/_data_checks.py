@@ -1,4 +1,4 @@
-"""Checks of training data: columns that never move, states that never follow, copies.
+"""Checks of training data: constant columns, states that never follow, copies.
 
 A training goes on all the same. The log says in one line what could not be learned,
 with the rule and the way out.
@@ -27,7 +27,7 @@ ROUND_OFF = 2**12 * np.finfo(np.float64).eps
 RESOLUTION = 1e-9
 
 
-class Columns(NamedTuple):
+class ColumnDescriptions(NamedTuple):
     """Names and magnitudes of the columns of features and targets."""
 
     features: Sequence[str]  #: names (d,)
@@ -46,7 +46,7 @@ class Columns(NamedTuple):
         input_dim: int,
         predicts: str,
         signals: Signals = UNKNOWN,
-    ) -> "Columns":
+    ) -> "ColumnDescriptions":
         """Names states and inputs as signals do, and all others by numbers from 1.
 
         Args:
@@ -70,7 +70,9 @@ class Columns(NamedTuple):
         return cls(features=states + inputs, outputs=outputs, magnitudes=magnitudes)
 
     @classmethod
-    def of_transitions(cls, transitions: Transitions, predicts: str) -> "Columns":
+    def of_transitions(
+        cls, transitions: Transitions, predicts: str
+    ) -> "ColumnDescriptions":
         """Names the columns of GPs that learn next states, or differences."""
         states, inputs = signal_names(transitions)
         magnitudes = None
@@ -79,17 +81,21 @@ class Columns(NamedTuple):
         return cls(features=states + inputs, outputs=states, magnitudes=magnitudes)
 
 
-class ColumnsAtRest(NamedTuple):
-    """Which columns of a training's data never move."""
+class ConstantColumns(NamedTuple):
+    """Which columns of a training's data are constant."""
 
     features: NDArray[np.bool_]  #: (d,)
     outputs: NDArray[np.bool_]  #: (k,)
 
     @classmethod
     def find(
-        cls, features: Tensor, targets: Tensor, columns: Columns, resolution: float
-    ) -> "ColumnsAtRest":
-        """Finds the columns of features (N, d) and targets (N, k) that never move.
+        cls,
+        features: Tensor,
+        targets: Tensor,
+        columns: ColumnDescriptions,
+        resolution: float,
+    ) -> "ConstantColumns":
+        """Finds the constant columns of features (N, d) and targets (N, k).
 
         Both are in the units of the data.
         """

@@ -353,7 +353,7 @@ class GPPosterior(TensorModel):
     def linearize(
         self, states: Array, inputs: Array, covariance: bool = True
     ) -> Linearized:
-        """Linearises the mean at P points (P, n), (P, m).
+        """Linearises the mean at K points (K, n), (K, m).
 
         The compiled kernels do it where they can, else torch.
         """

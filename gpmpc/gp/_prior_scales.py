@@ -1,6 +1,6 @@
-"""Prior scales of what never moves in the data of a training.
+"""Prior scales of what is constant in the data of a training.
 
-No likelihood depends on the length-scale of a feature that never moved, nor says how
+No likelihood depends on the length-scale of a feature that is constant, nor says how
 much an output varies that was never seen to. What is left is a prior, and it has to be
 modest: away from the data nothing is known. By default it is one unit of the data, as
 the length-scales that GPyTorch begins with (0.69) and leaves untouched. Where a column
@@ -78,7 +78,7 @@ def check_prior_settings(
     prior_deviation: float | None,
     resolution: float,
 ) -> None:
-    """Raises ``SettingError`` unless the settings of columns at rest are right."""
+    """Raises ``SettingError`` unless the settings of constant columns are right."""
     for value in _lengthscale_list(prior_lengthscale):
         if isinstance(value, str) and value == NO_EFFECT:
             continue

@@ -115,7 +115,7 @@ def min_max(
     """Maps the range of each column (N, d) onto [low, high].
 
     A constant column, as in ``standardize``, is mapped to the middle: else a solver's
-    round-off in a channel at rest would be blown up to the full interval.
+    round-off in a constant channel would be blown up to the full interval.
 
     Raises:
         SettingError: low is not below high.

@@ -39,7 +39,7 @@ _PLAIN_RATIO = 10.0  # sf / sn where the search begins
 # Mean of log l over log std(x~) at the random starts: smooth dynamics prefer long
 # length-scales.
 _LONGER = 1.0
-# Length-scale of an output that never changes, in standard deviations of its features.
+# Length-scale of a constant output, in standard deviations of its features.
 _SMOOTH = 5.0
 _REPEATED = 1e4  # sf / sn of such an output, at most: the data repeat themselves
 # Part of its magnitude: targets that vary by less vary as their magnitude.
@@ -89,8 +89,8 @@ class SoftLimits:
 
         Args:
             theta: (log l, log sf, log(sf / sn)) (d + 2,).
-            log_std: Logarithms of the features' standard deviations (d,); of one that
-                never moves, of its prior length-scale.
+            log_std: Logarithms of the features' standard deviations (d,); of a
+                constant one, of its prior length-scale.
         """
         width = np.full(len(theta), np.log(self.lengthscale_factor))
         width[-1] = np.log(self.signal_to_noise)
@@ -119,11 +119,31 @@ class SearchFeatures(NamedTuple):
     """The features of all GPs in scaled units."""
 
     points: np.ndarray  #: x~ (N, d)
-    #: their units: standard deviations, or magnitudes of what never moves (d,); see
+    #: their units: standard deviations, or magnitudes of constant ones (d,); see
     #: ``column_scales``
     scales: np.ndarray
-    constant: np.ndarray  #: which features never move (d,)
-    prior_lengthscales: np.ndarray  #: of those that never move (d,)
+    constant: np.ndarray  #: which features are constant (d,)
+    prior_lengthscales: np.ndarray  #: of the constant ones (d,)
+
+
+def _prior_lengthscales(features: SearchFeatures) -> np.ndarray:
+    """Returns the length-scales (d,) that constant features get.
+
+    One that is known to have no effect drops out of the kernel.
+    """
+    prior = features.prior_lengthscales
+    return np.where(np.isinf(prior), IGNORED * features.scales, prior)
+
+
+def _search_lengthscales(features: SearchFeatures) -> np.ndarray:
+    """Returns the length-scales (d,) that the box of the search is around.
+
+    They are the features' standard deviations, and the prior length-scales of constant
+    ones, unless these are infinite: no box holds them.
+    """
+    prior = features.prior_lengthscales
+    has_prior = features.constant & np.isfinite(prior)
+    return np.where(has_prior, prior, features.scales)
 
 
 class SearchResult(NamedTuple):
@@ -169,15 +189,8 @@ class OutputSearch:
         self._settings = settings
         self._deadline = deadline
         self._constant = features.constant
-        # A feature that is known to have no effect drops out of the kernel.
-        prior = features.prior_lengthscales
-        ignored = features.constant & np.isinf(prior)
-        self._log_prior = np.log(np.where(ignored, IGNORED * features.scales, prior))
-        # Where the search takes length-scales to be: the features' standard deviations,
-        # or the prior length-scales of those at rest. It differs from the prior above
-        # for a feature without effect alone, whose prior is outside of the box.
-        at_rest = features.constant & ~ignored
-        self._log_scales = np.log(np.where(at_rest, prior, features.scales))
+        self._log_prior = np.log(_prior_lengthscales(features))
+        self._log_scales = np.log(_search_lengthscales(features))
         self._log_output = np.log(output_std(targets))
         self._box = search_box(
             self._log_scales, self._log_output, settings.signal_to_noise_limit
@@ -219,14 +232,14 @@ class OutputSearch:
                 self._settings.time_limit,
             )
         theta = best.theta.copy()
-        # The likelihood says nothing of a feature that never moved: the prior does.
+        # The likelihood says nothing of a constant feature: the prior does.
         theta[:-2][self._constant] = self._log_prior[self._constant]
         explored = [optimum.objective for optimum in optima]
         explored += [math.nan] * (len(starts) - len(optima))
         return SearchResult(theta, best.objective, explored)
 
-    def result_at_rest(self, deviation: float) -> SearchResult:
-        """Returns hyperparameters of an output that never changes, without a search.
+    def result_of_constant(self, deviation: float) -> SearchResult:
+        """Returns hyperparameters of a constant output, without a search.
 
         The likelihood only ever asks for less signal and longer length-scales: for
         certainty everywhere, from data that have not seen the output vary. So the

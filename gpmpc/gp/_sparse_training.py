@@ -24,8 +24,8 @@ from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, TrainingError, check_choice, check_number
 from gpmpc.gp._data_checks import (
     RESOLUTION,
-    Columns,
-    ColumnsAtRest,
+    ColumnDescriptions,
+    ConstantColumns,
     checked_targets,
 )
 from gpmpc.gp._kernel import Hyperparameters, kernel_matrix
@@ -86,7 +86,7 @@ class SparseTrainer:
     iterations: int = 100  #: of L-BFGS, at most
     subset: int = 200  #: number of random transitions in the first, exact, training
     restarts: int = 1  #: random starts of that one
-    #: of features that never move in the data, and of outputs that never change; all
+    #: of features and outputs that are constant in the data; all
     #: three as in ``Trainer``
     prior_lengthscale: PriorLengthscales = None
     prior_deviation: float | None = 1.0
@@ -120,7 +120,7 @@ class SparseTrainer:
             transitions.input_dim,
             predicts=predicts,
             seed=seed,
-            columns=Columns.of_transitions(transitions, predicts),
+            columns=ColumnDescriptions.of_transitions(transitions, predicts),
         )
         return training.with_signals(transitions.signals)
 
@@ -131,7 +131,7 @@ class SparseTrainer:
         input_dim: int,
         predicts: Predicts | None = None,
         seed: int = 0,
-        columns: Columns | None = None,
+        columns: ColumnDescriptions | None = None,
     ) -> Training:
         """Trains on features x~ = (x, u) (N, n + m) and any targets (N, k).
 
@@ -156,7 +156,7 @@ class SparseTrainer:
         scales = torch.from_numpy(data.feature_scales) / scaling.factor
 
         rows = np.random.default_rng(seed).permutation(len(x))[: self.subset]
-        subset = self._subset_data(data, rows)
+        subset = self._subset_with_scaled_targets(data, rows)
         exact = self._exact_trainer().fit_data(subset, seed)
         subset_theta = scaled_theta(exact.posterior, scaling, subset.target_scaling)
         start_theta = _with_plain_starts(
@@ -175,13 +175,15 @@ class SparseTrainer:
         bound = _NegativeBound(
             x, y, scales, method=self.method, iterations=self.iterations
         )
-        bound.start_at(bound_theta, Z, fixed=_fixed_entries(bound_theta, data))
-        initial = bound.values()
-        bound.minimize()
-        objective = bound.values()
+        start = bound.pack(bound_theta, Z)
+        initial = bound.values(start)
+        best_vector = bound.minimize(
+            start, unsearched=_unsearched_entries(bound_theta, data)
+        )
+        objective = bound.values(best_vector)
         _check_finite(objective)
         gains = _noise_alone(y) - objective
-        gains[data.outputs_at_rest] = np.inf  # there is nothing to learn of them
+        gains[data.unsearched_outputs] = np.inf  # there is nothing to learn of them
         self._check_learned(
             gains,
             exact_gains=_noise_alone(y[rows]) - exact.objective,
@@ -189,7 +191,7 @@ class SparseTrainer:
             names=data.columns.outputs,
         )
 
-        best = bound.unpack(torch.from_numpy(bound.best))
+        best = bound.unpack(torch.from_numpy(best_vector))
         scaled_posterior = sparse_posterior(
             best.inducing,
             x,
@@ -220,11 +222,17 @@ class SparseTrainer:
             resolution=self.resolution,
         )
 
-    def _subset_data(self, data: TrainingData, rows: np.ndarray) -> TrainingData:
-        """Some rows with scaled targets, which may hold still what moves elsewhere."""
+    def _subset_with_scaled_targets(
+        self, data: TrainingData, rows: np.ndarray
+    ) -> TrainingData:
+        """Some rows, as exact GPs learn them; columns may be constant there alone.
+
+        Targets are scaled by all data, so that objectives of subset and bound compare.
+        Features are not: the search scales its box by their deviations in the subset.
+        """
         features = data.features[rows]
         scaled_targets = data.scaled_targets
-        constants = ColumnsAtRest.find(
+        constant = ConstantColumns.find(
             features, data.targets[rows], data.columns, self.resolution
         )
         return TrainingData(
@@ -235,7 +243,7 @@ class SparseTrainer:
             feature_scaling=identity(data.features),
             target_scaling=identity(scaled_targets),
             columns=data.columns,
-            constants=constants,
+            constant=constant,
             prior=data.prior.for_scaled_targets(data.target_scaling),
         )
 
@@ -300,7 +308,7 @@ def _with_plain_starts(
     scales: np.ndarray,
     targets: np.ndarray,
 ) -> np.ndarray:
-    """Returns theta (k, d + 2) with the plain start of what only the subset held still.
+    """Returns theta (k, d + 2) with plain starts of what only the subset has constant.
 
     Args:
         theta: Rows that the subset's training has found.
@@ -310,20 +318,20 @@ def _with_plain_starts(
         targets: Scaled (N, k).
     """
     started = theta.copy()
-    moves = subset.constants.features & ~data.constants.features
-    started[:, :-2][:, moves] = np.log(scales)[moves]
-    changes = subset.constants.outputs & ~data.constants.outputs
-    for a in np.flatnonzero(changes):
+    features = subset.constant.features & ~data.constant.features
+    started[:, :-2][:, features] = np.log(scales)[features]
+    outputs = subset.constant.outputs & ~data.constant.outputs
+    for a in np.flatnonzero(outputs):
         started[a] = plain_theta(scales, targets[:, a])
     return started
 
 
-def _fixed_entries(theta: np.ndarray, data: TrainingData) -> np.ndarray:
-    """Which entries of theta (k, d + 2) are not searched: those of what never moves."""
-    fixed = np.zeros(theta.shape, dtype=bool)
-    fixed[data.outputs_at_rest] = True
-    fixed[:, :-2][:, data.constants.features] = True
-    return fixed
+def _unsearched_entries(theta: np.ndarray, data: TrainingData) -> np.ndarray:
+    """Which entries of theta (k, d + 2) are not searched: those of constant columns."""
+    unsearched = np.zeros(theta.shape, dtype=bool)
+    unsearched[data.unsearched_outputs] = True
+    unsearched[:, :-2][:, data.constant.features] = True
+    return unsearched
 
 
 def _check_finite(objective: np.ndarray) -> None:
@@ -411,34 +419,34 @@ class _NegativeBound:
         self._max_iterations = iterations
         self._outputs = y.shape[1]
         self._theta_size = y.shape[1] * (x.shape[1] + 2)
-        self.best = np.empty(0)  #: the start, or the best point evaluated since
         self.evaluations = 0
-        self._fixed = np.empty(0, dtype=bool)
+        # Of the present search: the start, or the best point evaluated since.
+        self._best = np.empty(0)
         self._least = np.inf
         self._iterations = 0
 
-    def start_at(self, theta: np.ndarray, Z: Tensor, fixed: np.ndarray) -> None:
-        """Sets the start.
+    def pack(self, theta: np.ndarray, Z: Tensor) -> np.ndarray:
+        """Writes the rows of theta (k, d + 2) and Z (M, d) to a vector."""
+        return np.append(theta.ravel(), (Z / self._scales).numpy().ravel())
+
+    def minimize(self, start: np.ndarray, unsearched: np.ndarray) -> np.ndarray:
+        """Returns the best vector of a search by L-BFGS, in a box around the data.
+
+        The box holds the start.
 
         Args:
-            theta: (k, d + 2).
-            Z: (M, d).
-            fixed: Entries of theta that are not searched (k, d + 2).
+            start: The vector where it begins.
+            unsearched: Which entries of theta stay (k, d + 2).
         """
-        scaled = (Z / self._scales).numpy().ravel()
-        self.best = np.append(theta.ravel(), scaled)
-        self._fixed = np.append(fixed.ravel(), np.zeros(scaled.size, dtype=bool))
-
-    def minimize(self) -> None:
-        """Searches by L-BFGS in a box around the data that holds the start."""
+        self._best = start
         if not self._max_iterations:  # of none L-BFGS-B makes one
-            return
+            return start
         minimize(
             self,
-            self.best,
+            start,
             jac=True,
             method="L-BFGS-B",
-            bounds=self._bounds(),
+            bounds=self._bounds(start, unsearched),
             callback=self._report,
             options={
                 "ftol": _TOLERANCE,
@@ -447,8 +455,9 @@ class _NegativeBound:
                 "maxfun": 3 * self._max_iterations + 1,
             },
         )
+        return self._best
 
-    def _bounds(self) -> np.ndarray:
+    def _bounds(self, start: np.ndarray, unsearched: np.ndarray) -> np.ndarray:
         """Lower and upper bounds of the vector in two columns."""
         log_scales = self._scales.log().numpy()
         boxes = [
@@ -458,17 +467,19 @@ class _NegativeBound:
         smallest = (self._x.amin(0) / self._scales).numpy()
         largest = (self._x.amax(0) / self._scales).numpy()
         margin = 0.1 * (largest - smallest)
-        inducing = (len(self.best) - self._theta_size) // len(smallest)
+        inducing = (len(start) - self._theta_size) // len(smallest)
         lower = np.concatenate(
             [*(box.lower for box in boxes), np.tile(smallest - margin, inducing)]
         )
         upper = np.concatenate(
             [*(box.upper for box in boxes), np.tile(largest + margin, inducing)]
         )
-        lower = np.minimum(lower, self.best)
-        upper = np.maximum(upper, self.best)
-        lower[self._fixed] = self.best[self._fixed]
-        upper[self._fixed] = self.best[self._fixed]
+        lower = np.minimum(lower, start)
+        upper = np.maximum(upper, start)
+        stays = np.zeros(len(start), dtype=bool)
+        stays[: self._theta_size] = unsearched.ravel()
+        lower[stays] = start[stays]
+        upper[stays] = start[stays]
         return np.column_stack([lower, upper])
 
     def unpack(self, vector: Tensor) -> _Point:
@@ -477,13 +488,13 @@ class _NegativeBound:
         scaled = vector[self._theta_size :].reshape(-1, len(self._scales))
         return _Point(theta=theta, inducing=scaled * self._scales)
 
-    def values(self) -> np.ndarray:
-        """Computes minus the bound of every output (k,) at the best point.
+    def values(self, vector: np.ndarray) -> np.ndarray:
+        """Computes minus the bound of every output (k,) at a vector.
 
         Infinite where a matrix is not positive definite.
         """
         with torch.no_grad():
-            return self._evaluate(torch.from_numpy(self.best)).numpy()
+            return self._evaluate(torch.from_numpy(vector)).numpy()
 
     def __call__(self, vector: np.ndarray) -> tuple[float, np.ndarray]:
         """Computes the sum over the outputs, and its gradient."""
@@ -499,7 +510,7 @@ class _NegativeBound:
         if not np.isfinite(gradient).all():
             return FAILED, np.zeros_like(vector)
         if value < self._least:
-            self.best = vector.copy()
+            self._best = vector.copy()
             self._least = value
         return value, gradient
 

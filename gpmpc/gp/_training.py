@@ -24,7 +24,7 @@ from gpmpc.exceptions import (
 )
 from gpmpc.gp._data_checks import (
     RESOLUTION,
-    Columns,
+    ColumnDescriptions,
     checked_targets,
     constant_columns,
 )
@@ -75,13 +75,13 @@ class Training:
     #: data
     theta: np.ndarray
     #: negative log marginal likelihood plus penalty where the search ended (k,),
-    #: without the penalty of an output at rest, which is not searched
+    #: without the penalty of a constant output, which is not searched
     #: (``prior_deviation``); of a sparse training minus the bound on the log marginal
     #: likelihood; both of the scaled targets
     objective: np.ndarray
     #: of an exact training, the objective where the exploration from every start ended
     #: (k, restarts + 1), over the subset if there is one, NaN for starts that a time
-    #: limit left out, and for all but the first of an output at rest; of a sparse
+    #: limit left out, and for all but the first of a constant output; of a sparse
     #: training, where the search over the bound began (k, 1)
     explored: np.ndarray
     #: of the likelihood or of the bound, all starts and outputs together
@@ -139,16 +139,16 @@ class Trainer:
     #: so far is taken: what that is depends on the machine. One iteration over all
     #: points is made in any case. None: no limit
     time_limit: float | None = None
-    #: of features that never move in the data, for all or one each, in their units:
+    #: of features that are constant in the data, for all or one each, in their units:
     #: how far from the value that they have predictions hold. None: one unit;
     #: ``"no_effect"``: it is known that they have none
     prior_lengthscale: PriorLengthscales = None
-    #: of outputs that never change in the data: the standard deviation that they are
+    #: of outputs that are constant in the data: the standard deviation that they are
     #: supposed to have elsewhere, in their units; of a residual, in units of what a
     #: step changes. None: what the search finds, which is nearly none
     prior_deviation: float | None = 1.0
     #: a feature or a target that moves by no more than this, in its unit, or by
-    #: round-off, never moves
+    #: round-off, is constant
     resolution: float = RESOLUTION
 
     def __post_init__(self) -> None:
@@ -178,7 +178,7 @@ class Trainer:
             predicts=predicts,
             seed=seed,
             start=start,
-            columns=Columns.of_transitions(transitions, predicts),
+            columns=ColumnDescriptions.of_transitions(transitions, predicts),
         )
         return training.with_signals(transitions.signals)
 
@@ -221,7 +221,7 @@ class Trainer:
             predicts=posterior.predicts,
             seed=seed,
             start=replace(posterior, noise_variance=noise),
-            columns=Columns.of_tensors(
+            columns=ColumnDescriptions.of_tensors(
                 features,
                 targets,
                 posterior.input_dim,
@@ -240,7 +240,7 @@ class Trainer:
         predicts: Predicts | None = None,
         seed: int = 0,
         start: GPPosterior | None = None,
-        columns: Columns | None = None,
+        columns: ColumnDescriptions | None = None,
     ) -> Training:
         """Trains on features and any targets; the log names what they cannot teach.
 
@@ -315,11 +315,11 @@ class Trainer:
                 deadline=self._deadline(start_time, (a + 1) / k),
             )
             with threadpool_limits(1 if size < _ONE_THREAD else None, user_api="blas"):
-                deviation = _deviation_at_rest(data, a)
+                deviation = _deviation_of_constant(data, a)
                 if deviation is None:
                     results.append(search(first[a], perturbations[a, 1:], rows))
                 else:
-                    results.append(search.result_at_rest(deviation))
+                    results.append(search.result_of_constant(deviation))
             evaluations += search.evaluations
 
         objective = np.array([result.objective for result in results])
@@ -329,6 +329,7 @@ class Trainer:
             data.feature_scaling,
             data.target_scaling,
         )
+        # Factorised over the raw data, which restoring scaled ones would round.
         kernel = Hyperparameters.from_theta(torch.from_numpy(theta))
         posterior = GPPosterior.from_hyperparameters(
             data.features,
@@ -354,10 +355,9 @@ class Trainer:
     ) -> list[np.ndarray | None]:
         """The first start (d + 2,) of every output; None for the plain one.
 
-        Hyperparameters of a posterior say nothing of what its data held still. Where
-        the start's data held a feature constant and these do not, its length-scale
-        begins with its standard deviation; an output that is newly changing begins
-        with the plain start.
+        Hyperparameters of a posterior say nothing of what is constant in its data. A
+        feature that was constant there, and is not here, begins with its standard
+        deviation; such an output begins with the plain start.
         """
         if start is None:
             return [None] * data.targets.shape[1]
@@ -365,15 +365,18 @@ class Trainer:
         theta = scaled_theta(start, data.feature_scaling, data.target_scaling)
         start_features = start.features.cpu().double().numpy()
         was_constant = constant_columns(start_features, self.resolution)
-        newly_moving = was_constant & ~data.constants.features
-        theta[:, :-2][:, newly_moving] = np.log(features.scales)[newly_moving]
+        no_longer_constant = was_constant & ~data.constant.features
+        log_scales = np.log(features.scales)
+        theta[:, :-2][:, no_longer_constant] = log_scales[no_longer_constant]
         targets = start.targets.cpu().double().numpy()
-        never_changed = constant_columns(
+        outputs_were_constant = constant_columns(
             targets, self.resolution, data.columns.magnitudes
         )
         return [
-            None if constant else row
-            for row, constant in zip(theta, never_changed, strict=True)
+            None if was_constant_output else row
+            for row, was_constant_output in zip(
+                theta, outputs_were_constant, strict=True
+            )
         ]
 
     def _first_rows(
@@ -431,15 +434,15 @@ def _search_features(data: TrainingData) -> SearchFeatures:
     return SearchFeatures(
         points=data.feature_scaling.scale(data.features).numpy(),
         scales=data.feature_scales / factor,
-        constant=data.constants.features,
+        constant=data.constant.features,
         prior_lengthscales=data.prior.lengthscales / factor,
     )
 
 
-def _deviation_at_rest(data: TrainingData, output: int) -> float | None:
-    """The scaled prior deviation of an output at rest; None of one to be searched."""
+def _deviation_of_constant(data: TrainingData, output: int) -> float | None:
+    """The scaled prior deviation of a constant output; None of one to be searched."""
     deviations = data.prior.deviations
-    if deviations is None or not data.constants.outputs[output]:
+    if deviations is None or not data.constant.outputs[output]:
         return None
     return deviations[output] / float(data.target_scaling.factor[output])
 

@@ -1,4 +1,4 @@
-"""Training data, checked and with their scalings, and what they hold still.
+"""Training data, checked and with their scalings, and what is constant in them.
 
 Hyperparameters are searched as rows theta = (log l, log sf, log(sf / sn)), one an
 output, in scaled units; here they are converted to the units of the data and back.
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import check_tensors
-from gpmpc.gp._data_checks import Columns, ColumnsAtRest, column_scales
+from gpmpc.gp._data_checks import ColumnDescriptions, ConstantColumns, column_scales
 from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._prior_scales import (
     PriorLengthscales,
@@ -69,9 +69,9 @@ class TrainingData:
     predicts: Predicts  #: what the targets mean
     feature_scaling: Scaling
     target_scaling: Scaling
-    columns: Columns  #: names and magnitudes of features and targets
-    constants: ColumnsAtRest  #: what never moves
-    prior: PriorScales  #: of what never moves
+    columns: ColumnDescriptions  #: names and magnitudes of features and targets
+    constant: ConstantColumns
+    prior: PriorScales  #: of what is constant
 
     def __len__(self) -> int:
         return len(self.features)
@@ -84,12 +84,12 @@ class TrainingData:
     @property
     def feature_scales(self) -> NDArray[np.float64]:
         """Scales of the features (d,); see ``column_scales``."""
-        return column_scales(self.features.numpy(), self.constants.features)
+        return column_scales(self.features.numpy(), self.constant.features)
 
     @property
-    def outputs_at_rest(self) -> NDArray[np.bool_]:
-        """Outputs (k,) that never change and have a prior deviation: not searched."""
-        return self.constants.outputs & (self.prior.deviations is not None)
+    def unsearched_outputs(self) -> NDArray[np.bool_]:
+        """Outputs (k,) that are constant and have a prior deviation."""
+        return self.constant.outputs & (self.prior.deviations is not None)
 
 
 def read_training_data(
@@ -97,7 +97,7 @@ def read_training_data(
     targets: Tensor,
     input_dim: int,
     predicts: Predicts,
-    columns: Columns | None,
+    columns: ColumnDescriptions | None,
     settings: DataSettings,
 ) -> TrainingData:
     """Checks and scales training data; the log names what they cannot teach.
@@ -124,7 +124,7 @@ def read_training_data(
     target_scaling = settings.scaling(targets, output_names)
 
     if columns is None:
-        columns = Columns.of_tensors(features, targets, input_dim, predicts)
+        columns = ColumnDescriptions.of_tensors(features, targets, input_dim, predicts)
     deviation_units = columns.deviation_units
     if deviation_units is None:
         deviation_units = np.ones(targets.shape[1])
@@ -136,7 +136,7 @@ def read_training_data(
         feature_scaling=feature_scaling,
         target_scaling=target_scaling,
         columns=columns,
-        constants=ColumnsAtRest.find(features, targets, columns, settings.resolution),
+        constant=ConstantColumns.find(features, targets, columns, settings.resolution),
         prior=PriorScales.of_settings(
             settings.prior_lengthscale,
             settings.prior_deviation,
@@ -186,20 +186,20 @@ def scaled_theta(
 
 
 def _warn_of_constants(data: TrainingData, resolution: float) -> None:
-    """Logs what the data hold still, and the prior that is taken instead.
+    """Logs what is constant in the data, and the prior that is taken instead.
 
     What a setting says is known is not named: a feature of an infinite length-scale,
     and outputs whose deviation the search is to find.
     """
     size = len(data)
     prior = data.prior
-    features_at_rest = data.constants.features & np.isfinite(prior.lengthscales)
-    lengthscales = _distinct(prior.lengthscales[features_at_rest])
-    outputs_at_rest = data.outputs_at_rest
+    constant_features = data.constant.features & np.isfinite(prior.lengthscales)
+    lengthscales = _distinct(prior.lengthscales[constant_features])
+    constant_outputs = data.unsearched_outputs
     deviations = ""
     if prior.deviations is not None:
-        deviations = _distinct(prior.deviations[outputs_at_rest])
-    if size == 1 and (features_at_rest.any() or outputs_at_rest.any()):
+        deviations = _distinct(prior.deviations[constant_outputs])
+    if size == 1 and (constant_features.any() or constant_outputs.any()):
         _log.warning(
             "training: one row says nothing of how anything varies. Supposed are "
             "length-scales of %s (prior_lengthscale) and deviations of %s "
@@ -217,7 +217,7 @@ def _warn_of_constants(data: TrainingData, resolution: float) -> None:
             data.features.shape[1],
             data.features.shape[1] + 2,
         )
-    if features_at_rest.any():
+    if constant_features.any():
         _log.warning(
             "training: never moves by more than %.1g (resolution) in the %d rows: %s. "
             "What it changes is not known: away from that value predictions return to "
@@ -225,17 +225,17 @@ def _warn_of_constants(data: TrainingData, resolution: float) -> None:
             "where it is known to change nothing)",
             resolution,
             size,
-            _listed(data.columns.features, data.features[0], features_at_rest),
+            _listed(data.columns.features, data.features[0], constant_features),
             lengthscales,
         )
-    if outputs_at_rest.any():
+    if constant_outputs.any():
         _log.warning(
             "training: never changes by more than %.1g (resolution) in the targets of "
             "the %d rows: %s. How much it varies elsewhere is not known: supposed is a "
             "deviation of %s (prior_deviation)",
             resolution,
             size,
-            _listed(data.columns.outputs, data.targets[0], outputs_at_rest),
+            _listed(data.columns.outputs, data.targets[0], constant_outputs),
             deviations,
         )
 

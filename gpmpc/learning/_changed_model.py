@@ -12,6 +12,7 @@ from torch import Tensor
 from gpmpc._angles import angles_of, state_difference
 from gpmpc._dynamics import Array, DynamicsModel, Linearized, linearize, to_array
 from gpmpc._kernels import Window, linearize_gps
+from gpmpc._kernels._window import V as WHITENED_TARGETS
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
@@ -30,11 +31,11 @@ class ChangeWindows(NamedTuple):
     successor: Window | None
 
 
-class ModelError(NamedTuple):
+class ObservedChange(NamedTuple):
     """What a transition says of the change."""
 
-    point: Array  #: (phi, u, t) (d,)
-    error: Array  #: what d was there (k,)
+    point: Array  #: (phi, u, t), where it was seen
+    value: Array  #: what d was there (k,)
     latent_variance: Array  #: variance of the model alone there (k,)
 
 
@@ -43,7 +44,7 @@ class Comparison(NamedTuple):
 
     with_change: Innovation
     without_change: Innovation
-    model: "ChangedModel"  #: with the step as a further point of its change
+    model_with_step: "ChangedModel"  #: the step is a further point of its change
 
     def planned(self, active: bool) -> Innovation:
         """Returns the innovation of the model that plans.
@@ -180,7 +181,7 @@ class ChangedModel(Wrapper):
         that remain is made beforehand, some rows with every new point.
 
         Args:
-            point: (phi, u, t) (d,).
+            point: (phi, u, t).
             target: What d is there (k,).
             noise_variance: Of the target (k,).
 
@@ -190,17 +191,19 @@ class ChangedModel(Wrapper):
         capacity = self.learning.points
         points_to_drop = max(1, capacity // 5)  # at once
         points_until_rebuild = capacity - points_to_drop
-        # From 1 to ``points_to_drop`` while the successor's factor is made.
-        rebuild_step = len(self) - points_until_rebuild
+        # Up to ``points_to_drop`` while the successor's factor is made.
+        steps_into_rebuild = max(0, len(self) - points_until_rebuild)
         current, successor = self.change
-        if rebuild_step > 0 and successor is None:
+        if steps_into_rebuild > 0 and successor is None:
+            # Chosen now, a fifth of the room ahead of when they go.
             successor = current.without(self._first_to_go(points_to_drop))
-        if successor is not None and rebuild_step == points_to_drop:
+        if successor is not None and steps_into_rebuild == points_to_drop:
             current = successor
             successor = None
         elif successor is not None:
             # Rows cost the square of their number: so every step does as much.
-            part = (rebuild_step / points_to_drop) ** (1 / 3)
+            # Until it takes over nothing predicts by it.
+            part = (steps_into_rebuild / points_to_drop) ** (1 / 3)
             rows = int(points_until_rebuild * part)
             successor = successor.append(point, target, noise_variance, rows=rows)
         current = current.append(point, target, noise_variance)
@@ -218,7 +221,7 @@ class ChangedModel(Wrapper):
         other.__dict__.update(self.__dict__ | changes)
         return other
 
-    def error(self, state: Array, input: Array, next_state: Array) -> ModelError:
+    def observe(self, state: Array, input: Array, next_state: Array) -> ObservedChange:
         """Computes what a transition says of the change.
 
         Args:
@@ -232,9 +235,9 @@ class ChangedModel(Wrapper):
         z, v, _ = self.features.linearize(states, inputs)
         error = state_difference(next_state, prediction.mean[0], self.angles)
         covariance = cast(Array, prediction.covariance)[0]
-        return ModelError(
+        return ObservedChange(
             point=np.concatenate([z[0], v[0], [self.time]]),
-            error=self.B_inverse @ error,
+            value=self.B_inverse @ error,
             latent_variance=self.explainable_variance(covariance),
         )
 
@@ -246,20 +249,25 @@ class ChangedModel(Wrapper):
         """
         return ((self.B_inverse @ covariance) * self.B_inverse).sum(-1)
 
-    def compare(self, step: LearningStep) -> Comparison:
-        """Compares predictions of a step with the change and without it."""
-        model = self.with_point(step.point, step.error, step.noise_variance)
+    def predict_then_learn(self, step: LearningStep) -> Comparison:
+        """Compares predictions of a step with the change and without, and learns it.
+
+        The new point's row of the factor holds its innovation, given the points before
+        it.
+        """
+        model = self.with_point(step.point, step.observed_change, step.noise_variance)
         last = model.last_innovation()
-        change_variance = last.variance - step.noise_variance
         latent = self.latent_left_by_change(
-            step.latent_variance, change_variance, self.signal
+            model_variance=step.latent_variance,
+            change_variance=last.variance - step.noise_variance,
+            prior_variance=self.signal,
         )
         return Comparison(
             with_change=Innovation(last.error, last.variance + latent),
             without_change=Innovation(
-                step.error, step.noise_variance + step.latent_variance
+                step.observed_change, step.noise_variance + step.latent_variance
             ),
-            model=model,
+            model_with_step=model,
         )
 
     def last_innovation(self) -> Innovation:
@@ -270,26 +278,28 @@ class ChangedModel(Wrapper):
         """
         column = self.change.current.columns[:, len(self) - 1]
         root = column[:, len(self) - 1]
-        return Innovation(error=column[:, -1] * root, variance=root**2)
+        return Innovation(error=column[:, WHITENED_TARGETS] * root, variance=root**2)
 
-    def latent_left_by_change(self, latent: Any, variance: Any, signal: Any) -> Any:
+    def latent_left_by_change(
+        self, model_variance: Any, change_variance: Any, prior_variance: Any
+    ) -> Any:
         """Computes the variance of the model alone that points of d leave.
 
-            latent - max(latent - signal, 0) (1 - min(variance / signal, 1))
+            model - max(model - prior, 0) (1 - min(change / prior, 1))
 
         Where the model alone varies by more than d does before it has seen a point, it
         knows nothing, as where an input moves that its data held still. There an error
-        teaches both at once, and of that excess as large a part is left as of the
-        signal is in d's own variance.
+        teaches both at once, and of that excess as large a part is left as of d's prior
+        variance.
 
         Args:
-            latent: Variance of the model alone (*batch, k), of NumPy or torch.
-            variance: Of d with its points (*batch, k).
-            signal: Of d without (k,).
+            model_variance: Of the model alone (*batch, k), of NumPy or torch.
+            change_variance: Of d with its points (*batch, k).
+            prior_variance: Of d without (k,).
         """
-        excess = (latent - signal).clip(0.0)
-        left = (variance / signal).clip(None, 1.0)
-        return latent - excess * (1.0 - left)
+        excess = (model_variance - prior_variance).clip(0.0)
+        left = (change_variance / prior_variance).clip(None, 1.0)
+        return model_variance - excess * (1.0 - left)
 
     @property
     def posterior(self) -> GPPosterior:
@@ -332,9 +342,11 @@ class ChangedModel(Wrapper):
         change_mean = change.mean.to(belief.mean)
         change_variance = change.variance.to(belief.mean)
         B_inverse = torch.as_tensor(self.B_inverse).to(belief.mean)
-        latent = ((B_inverse @ belief.covariance) * B_inverse).sum(-1)
-        signal = torch.as_tensor(self.signal).to(belief.mean)
-        latent_left = self.latent_left_by_change(latent, change_variance, signal)
+        latent_left = self.latent_left_by_change(
+            model_variance=((B_inverse @ belief.covariance) * B_inverse).sum(-1),
+            change_variance=change_variance,
+            prior_variance=torch.as_tensor(self.signal).to(belief.mean),
+        )
         variance = latent_left + change_variance
         mean = belief.mean + change_mean @ self.B.mT
         return Gaussian(mean, self.B @ torch.diag_embed(variance) @ self.B.mT)
@@ -359,8 +371,11 @@ class ChangedModel(Wrapper):
         V = model.covariance
         if V is not None and change.covariance is not None:
             variance = np.diagonal(change.covariance, axis1=1, axis2=2)
-            latent = self.explainable_variance(V)
-            latent_left = self.latent_left_by_change(latent, variance, self.signal)
+            latent_left = self.latent_left_by_change(
+                model_variance=self.explainable_variance(V),
+                change_variance=variance,
+                prior_variance=self.signal,
+            )
             variance = variance + latent_left
             V = (B * variance[:, None, :]) @ B.T
         return Linearized(

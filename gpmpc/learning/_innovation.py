@@ -36,8 +36,9 @@ class LearningStep(NamedTuple):
     state: Array  #: measured before it (n,)
     input: Array  #: applied (m,)
     next_state: Array  #: measured after it (n,)
-    point: Array  #: (phi, u, t), where d is seen (d,)
-    error: Array  #: of the model alone, as far as a change can explain it (k,)
+    point: Array  #: (phi, u, t), where d is seen
+    #: what d was there: the error of the model alone, as far as d can explain it (k,)
+    observed_change: Array
     latent_variance: Array  #: variance of the model alone (k,)
     noise_variance: Array  #: variance of the noise of this flight (k,)
 

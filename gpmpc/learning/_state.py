@@ -49,9 +49,8 @@ class LearningState:
 
     model: ChangedModel  #: the model with its change
     state: Array  #: the last one that was measured (n,)
-    #: of the model alone in the last step, as far as a change can explain it (k,); NaN
-    #: where it is unknown
-    error: Array
+    #: what d was in the last step (k,); NaN where it is unknown
+    observed_change: Array
     #: squared differences of successive errors over those expected of the model's
     #: noise, of the last steps (w,)
     noise_ratios: Array
@@ -76,7 +75,7 @@ class LearningState:
         return cls(
             model=model,
             state=np.array(state, dtype=float),
-            error=np.full(len(model.gp_noise), np.nan),
+            observed_change=np.full(len(model.gp_noise), np.nan),
             noise_ratios=np.empty(0),
             leads=np.empty(0),
             version=version,
@@ -113,13 +112,13 @@ class LearningState:
         return replace(self, input_of_policy=input)
 
     def with_measurement(
-        self, state: Array, error: Array, noise_ratios: Array
+        self, state: Array, observed_change: Array, noise_ratios: Array
     ) -> "LearningState":
         """Returns the state after a further measurement (n,)."""
         return replace(
             self,
             state=state,
-            error=error,
+            observed_change=observed_change,
             noise_ratios=noise_ratios,
             # A change that was tried for a step ends.
             version=self.version + self._tries_new_plant,
@@ -138,9 +137,11 @@ class LearningState:
 
     def without_doubt(self, doubt: Doubt) -> "LearningState":
         """Returns the state without the steps that were in doubt."""
-        unknown = np.full_like(self.error, np.nan)
         return replace(
-            self, error=unknown, noise_ratios=doubt.trusted_noise_ratios, doubt=None
+            self,
+            observed_change=np.full_like(self.observed_change, np.nan),
+            noise_ratios=doubt.trusted_noise_ratios,
+            doubt=None,
         )
 
     def after_gap(self, state: Array) -> "LearningState":
@@ -151,7 +152,7 @@ class LearningState:
         after = replace(
             self,
             state=np.array(state, dtype=float),
-            error=np.full_like(self.error, np.nan),
+            observed_change=np.full_like(self.observed_change, np.nan),
             # A change that is used, or was tried, is another one after the gap.
             version=self.version + (self.active or self._tries_new_plant),
             doubt=None,
@@ -166,9 +167,10 @@ class LearningState:
         model = self.model if self.active else self.model.model
         local = linearize(model, start.mean[None], step.input[None])
         A = local.A[0]
-        B = self.model.B_array
+        effect = self.model.B_array
         latent = cast(Array, local.covariance)[0]
-        noise = (B * step.noise_variance) @ B.T + np.diag(self.model.further_noise)
+        noise = (effect * step.noise_variance) @ effect.T
+        noise = noise + np.diag(self.model.further_noise)
         return Expectation(
             mean=local.mean[0],
             covariance=A @ start.covariance @ A.T + latent + noise,

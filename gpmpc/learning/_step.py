@@ -43,11 +43,11 @@ def learn_from_step(
     # Arrays of their own: callers may reuse theirs.
     input = np.array(input, dtype=float)
     measured = np.array(measured, dtype=float)
-    observed = model.error(before.state, input, measured)
-    if not (np.abs(observed.error) < _ABSURD * np.sqrt(model.gp_noise)).all():
+    observed = model.observe(before.state, input, measured)
+    if not (np.abs(observed.value) < _ABSURD * np.sqrt(model.gp_noise)).all():
         return before.after_gap(measured)
-    noise_ratios = _with_noise_ratio(before, observed.error)
-    seen = before.with_measurement(measured, observed.error, noise_ratios)
+    noise_ratios = _with_noise_ratio(before, observed.value)
+    seen = before.with_measurement(measured, observed.value, noise_ratios)
     if len(noise_ratios) < _FEWEST_RATIOS:
         return seen.later()
     step = LearningStep(
@@ -55,13 +55,13 @@ def learn_from_step(
         input=input,
         next_state=measured,
         point=observed.point,
-        error=observed.error,
+        observed_change=observed.value,
         latent_variance=observed.latent_variance,
         noise_variance=_noise_variance(noise_ratios, model),
     )
-    comparison = model.compare(step)
+    comparison = model.predict_then_learn(step)
     if before.doubt is not None:
-        # Handed over beside ``seen``, whose it is: here it is known to be one.
+        # It is that of ``seen`` as well, and not None here.
         return _resolve_doubt(seen, step, comparison, before.doubt)
     innovation = comparison.planned(before.active)
     surprising = innovation.largest_square > model.learning.surprise
@@ -73,15 +73,15 @@ def learn_from_step(
             seen,
             step,
             comparison,
-            expected,
+            expected_if_wrong=expected,
             trusted_noise_ratios=before.noise_ratios,
         )
     return seen.later()
 
 
-def _with_noise_ratio(before: LearningState, error: Array) -> Array:
-    """Returns the noise ratios (w,) with the one of a further error (k,)."""
-    squares = (error - before.error) ** 2 / before.model.gp_noise
+def _with_noise_ratio(before: LearningState, observed_change: Array) -> Array:
+    """Returns the noise ratios (w,) with the one of a further observed change (k,)."""
+    squares = (observed_change - before.observed_change) ** 2 / before.model.gp_noise
     ratio = float(squares.mean()) / 2.0
     if not np.isfinite(ratio):
         return before.noise_ratios
@@ -108,7 +108,9 @@ def _chi2_median(degrees: int) -> float:
 def _accept(seen: LearningState, comparison: Comparison) -> LearningState:
     """Makes a step a point of the change, and decides whether the change is used."""
     unexplained_steps = max(0, seen.unexplained_steps - 1)
-    learned = replace(seen, model=comparison.model, unexplained_steps=unexplained_steps)
+    learned = replace(
+        seen, model=comparison.model_with_step, unexplained_steps=unexplained_steps
+    )
     return _count_lead(learned, comparison.lead)
 
 
@@ -131,7 +133,7 @@ def _put_in_doubt(
     seen: LearningState,
     step: LearningStep,
     comparison: Comparison,
-    expected: Expectation,
+    expected_if_wrong: Expectation,
     trusted_noise_ratios: Array,
 ) -> LearningState:
     """Holds a measurement back that no prediction explains.
@@ -140,28 +142,29 @@ def _put_in_doubt(
         seen: With the measurement.
         step: The step that led to it.
         comparison: Of the predictions of the step.
-        expected: Where the plant is if all measurements in doubt are wrong.
+        expected_if_wrong: Where the plant is if all measurements in doubt are wrong.
         trusted_noise_ratios: Those before the steps in doubt.
     """
     settings = seen.model.learning
-    if seen.doubt is None:
+    previous_doubt = seen.doubt  # that the measurement did not resolve
+    if previous_doubt is None:
         unexplained_steps = seen.unexplained_steps
         steps_in_doubt = 1
     else:
         unexplained_steps = min(seen.unexplained_steps + 1, _PATIENCE)
-        steps_in_doubt = seen.doubt.steps_in_doubt + 1
+        steps_in_doubt = previous_doubt.steps_in_doubt + 1
 
     new_plant = None
     confirmations_left = 1 + unexplained_steps
     tries_new_plant = False
-    if not _is_frozen(seen, step, expected):
-        alone = seen.model.without_points().compare(step)
-        new_plant = alone.model.later(1.0)
+    if not _is_frozen(seen, step, expected_if_wrong):
+        alone = seen.model.without_points().predict_then_learn(step)
+        new_plant = alone.model_with_step.later(1.0)
         further = alone.with_change.largest_square / settings.surprise
         confirmations_left += int(min(further, _MOST_CONFIRMATIONS))
         tries_new_plant = confirmations_left == 1 and _acts_like_input(
             innovation=comparison.planned(seen.active),
-            by_input=seen.model.B_inverse @ expected.by_input,
+            by_input=seen.model.B_inverse @ expected_if_wrong.by_input,
             surprise=settings.surprise,
         )
 
@@ -169,7 +172,7 @@ def _put_in_doubt(
         seen,
         unexplained_steps=unexplained_steps,
         doubt=Doubt(
-            expected=expected,
+            expected=expected_if_wrong,
             trusted_noise_ratios=trusted_noise_ratios,
             new_plant=new_plant,
             confirmations_left=confirmations_left,
@@ -214,8 +217,8 @@ def _resolve_doubt(
     """Explains the measurement in doubt by the one after it."""
     settings = seen.model.learning
     # The measurement was wrong: what is measured follows from the state before it.
-    expected = seen.expect(doubt.expected, step)
-    if_wrong = seen.innovation(expected)
+    expected_if_wrong = seen.expect(doubt.expected, step)
+    if_wrong = seen.innovation(expected_if_wrong)
     # The plant was moved: what is measured follows from the measurement in doubt.
     if_moved = comparison.planned(seen.active)
 
@@ -225,7 +228,7 @@ def _resolve_doubt(
         return _switch_plant(seen, new_plant)
     if new_plant is not None:
         confirmed = Doubt(
-            expected=expected,
+            expected=expected_if_wrong,
             trusted_noise_ratios=doubt.trusted_noise_ratios,
             new_plant=new_plant.later(1.0),
             confirmations_left=doubt.confirmations_left - 1,
@@ -234,7 +237,9 @@ def _resolve_doubt(
         return _count_doubtful_lead(replace(seen, doubt=confirmed), comparison.lead)
     if min(if_moved.largest_square, if_wrong.largest_square) <= settings.surprise:
         return _count_doubtful_lead(seen.without_doubt(doubt), comparison.lead)
-    return _put_in_doubt(seen, step, comparison, expected, doubt.trusted_noise_ratios)
+    return _put_in_doubt(
+        seen, step, comparison, expected_if_wrong, doubt.trusted_noise_ratios
+    )
 
 
 def _new_plant_if_confirmed(
@@ -250,11 +255,11 @@ def _new_plant_if_confirmed(
     """
     if doubt.new_plant is None or step.repeats.all():
         return None
-    comparison = doubt.new_plant.compare(step)
+    comparison = doubt.new_plant.predict_then_learn(step)
     innovation = comparison.with_change
     explained = innovation.largest_square <= settings.surprise
     if explained and innovation.log_density > density_to_beat:
-        return comparison.model
+        return comparison.model_with_step
     return None
 
 

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
 from gpmpc.gp import Trainer, standardize
-from gpmpc.gp._data_checks import Columns
+from gpmpc.gp._data_checks import ColumnDescriptions
 from gpmpc.logs._log import Log
 from gpmpc.models._log_model import LogModel, OutputGP
 from gpmpc.models._windows import Windows
@@ -47,7 +47,7 @@ def train_output_gp(
     )
     if sees_memory:
         names = [f"regressor {i + 1}" for i in range(features.shape[1])]
-    columns = Columns(
+    columns = ColumnDescriptions(
         features=names,
         outputs=[model.kinematics.output_names[output] for output in outputs],
     )

@@ -71,12 +71,12 @@ class Features:
 
     @property
     def dim(self) -> int:
-        """Number of features of the state, d."""
+        """Number of features of the state, s; a GP of them sees d = s + m_s."""
         return len(self.states) + len(self.angles)
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
-        """Index of the state that each feature is a function of (d,)."""
+        """Index of the state that each feature is a function of (s,)."""
         columns: list[int] = []
         for i in self.states:
             columns += [i, i] if i in self.angles else [i]
@@ -95,7 +95,7 @@ class Features:
 
     @cached_property
     def _selection(self) -> Array:
-        """Matrix of the selection (d, n): 1 in the column of each feature's state."""
+        """Matrix of the selection (s, n): 1 in the column of each feature's state."""
         return np.eye(self.state_dim)[self.columns]
 
     def __call__(self, state: Tensor, input: Tensor) -> tuple[Tensor, Tensor]:
@@ -106,7 +106,7 @@ class Features:
             input: (*batch, m).
 
         Returns:
-            The features (*batch, d), and the selected inputs (*batch, m_s).
+            The features (*batch, s), and the selected inputs (*batch, m_s).
         """
         selected_inputs = input[..., list(self.inputs)]
         features = state[..., self.columns.tolist()]
@@ -129,7 +129,7 @@ class Features:
             inputs: (K, m).
 
         Returns:
-            The features (K, d), the selected inputs (K, m_s), and slopes (K, d): of
+            The features (K, s), the selected inputs (K, m_s), and slopes (K, s): of
             each feature one number, its derivative by the one state that it is a
             function of (``columns``). None where all of these are one.
         """
@@ -153,7 +153,7 @@ class Features:
         """Applies the chain rule to the derivatives of a function of the features.
 
         Args:
-            by_features: Derivatives by the features (K, k, d).
+            by_features: Derivatives by the features (K, k, s).
             by_inputs: Derivatives by the selected inputs (K, k, m_s).
             slopes: Derivatives of the features, from ``linearize``.
 

@@ -15,6 +15,7 @@ input (a rate of body axes, or a coarse time step), it is.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -63,41 +64,92 @@ def kinematic_residual(
         next_states: x[k+1] (N, n).
         time_step: h [s].
     """
-    n = states.shape[1]
-    A = torch.eye(n, dtype=states.dtype)
     predicted = states
     if nominal is not None:
         predicted = nominal_next_state(nominal, states, inputs, features.angles)
     change = state_difference(next_states, predicted, features.angles)
     basis = _basis(torch.cat(features(states, inputs), dim=1))
-    effect = torch.eye(n, dtype=states.dtype)
-    # What is not learned of each state's change, at every row (N, n).
-    missed = torch.zeros_like(states)
-    learned = list(range(n))
+    integrals = []
     for rate, position in _from_the_highest(rates):
-        unexplained = change[:, position]
-        if nominal is None:
-            unexplained = unexplained - time_step * states[:, rate]
+        position_change = change[:, position]
+        if nominal is None:  # a known model has moved it by its rate already
+            position_change = position_change - time_step * states[:, rate]
             if position in features.angles:  # a turn too much may be of either part
-                unexplained = wrap(unexplained)
+                position_change = wrap(position_change)
         rate_change = time_step * change[:, rate]
-        c = _integration_coefficient(unexplained, rate_change, basis)
-        remainder = unexplained - c * rate_change
-        A[position] += time_step * A[rate] * c
-        A[position, rate] += time_step * (1 - c)
-        effect_by_rate = c * time_step * effect[rate]
-        # What is missed of a rate is missed of its position as well.
-        missed[:, position] = c * time_step * missed[:, rate]
-        if _is_learnable(remainder, basis):
-            effect[position] += effect_by_rate
-            continue
-        effect[position] = effect_by_rate
-        missed[:, position] += remainder
-        learned.remove(position)
+        c = _integration_coefficient(position_change, rate_change, basis)
+        remainder = position_change - c * rate_change
+        integrals.append(
+            _Integral(rate, position, c, remainder, _is_learnable(remainder, basis))
+        )
     if nominal is None:
-        identity = Affine.identity(n, inputs.shape[1])
-        nominal = Affine(A=A, B=identity.B, c=identity.c)
-    return KinematicResidual(nominal, effect[:, learned], missed.square().mean(dim=0))
+        nominal = _integrating_model(integrals, states, inputs, time_step)
+    return KinematicResidual(
+        nominal=nominal,
+        B=_effect_of_learned(integrals, states, time_step),
+        noise=_unlearned_noise(integrals, states, time_step),
+    )
+
+
+class _Integral(NamedTuple):
+    """How a position x_i follows from its rate x_j."""
+
+    rate: int  #: j
+    position: int  #: i
+    c: float  #: weight of the new rate; 1 - c is that of the old one
+    remainder: Tensor  #: what the rate does not explain of x_i[k+1] (N,)
+    remainder_is_learned: bool  #: by a GP of its own; otherwise it is noise
+
+
+def _integrating_model(
+    integrals: Sequence[_Integral], states: Tensor, inputs: Tensor, h: float
+) -> Affine:
+    """Returns x[k+1] = A x[k] of positions that are moved by their rates.
+
+    x_i[k+1] = x_i + h ((1 - c) x_j + c x_j[k+1]), where row j of A gives x_j[k+1].
+    """
+    n = states.shape[1]
+    A = torch.eye(n, dtype=states.dtype)
+    for rate, position, c, *_ in integrals:
+        A[position] += h * A[rate] * c
+        A[position, rate] += h * (1 - c)
+    rest = Affine.identity(n, inputs.shape[1])
+    return Affine(A=A, B=rest.B, c=rest.c)
+
+
+def _effect_of_learned(
+    integrals: Sequence[_Integral], states: Tensor, h: float
+) -> Tensor:
+    """Returns the effect (n, k) of what is learned: it moves x_i by c h as it does x_j.
+
+    A position whose remainder is noise has no output of its own.
+    """
+    n = states.shape[1]
+    effect = torch.eye(n, dtype=states.dtype)
+    learned = list(range(n))
+    for rate, position, c, _, remainder_is_learned in integrals:
+        by_rate = c * h * effect[rate]
+        if remainder_is_learned:
+            effect[position] += by_rate
+        else:
+            effect[position] = by_rate
+            learned.remove(position)
+    return effect[:, learned]
+
+
+def _unlearned_noise(
+    integrals: Sequence[_Integral], states: Tensor, h: float
+) -> Tensor:
+    """Returns the variance (n,) of what no output learns.
+
+    What is missed of a rate is missed of its position as well.
+    """
+    missed = torch.zeros_like(states)
+    for rate, position, c, remainder, remainder_is_learned in integrals:
+        missed[:, position] = c * h * missed[:, rate]
+        if not remainder_is_learned:
+            missed[:, position] += remainder
+    return missed.square().mean(dim=0)
 
 
 def _from_the_highest(rates: Mapping[int, int]) -> list[tuple[int, int]]:
@@ -117,9 +169,9 @@ def _basis(features: Tensor) -> Tensor:
     """
     size, d = features.shape
     spread = features.std(dim=0, correction=0)
-    at_rest = torch.from_numpy(constant_columns(features.numpy(), resolution=0.0))
+    is_constant = torch.from_numpy(constant_columns(features.numpy(), resolution=0.0))
     # What moves by round-off keeps its unit, and drops out below.
-    scale = torch.where(at_rest, 1.0, spread)
+    scale = torch.where(is_constant, 1.0, spread)
     scaled = (features - features.mean(dim=0)) / scale
     one = torch.ones(size, 1, dtype=features.dtype)
     columns = [one, scaled, scaled.square()]

@@ -291,10 +291,10 @@ class ResidualModel(TensorModel):
         check_query(self, state, input)
         features, selected_inputs = self.features(state, input)
         d = self.residual.predict(features, selected_inputs)
-        B = effect_matrix(self.B, state)
+        effect = effect_matrix(self.B, state)
         nominal = nominal_next_state(self.nominal, state, input, self.angles)
-        mean = nominal + (B @ d.mean[..., None])[..., 0]
-        return Gaussian(mean, B @ d.covariance @ B.mT)
+        mean = nominal + (effect @ d.mean[..., None])[..., 0]
+        return Gaussian(mean, effect @ d.covariance @ effect.mT)
 
     def predict_mean(self, states: Array, inputs: Array) -> Array:
         """Computes the mean of the next states (K, n) without derivatives.
@@ -306,10 +306,10 @@ class ResidualModel(TensorModel):
         x, u = tensors_for(self, states, inputs)
         with torch.no_grad():
             nominal = to_array(nominal_next_state(self.nominal, x, u, self.angles))
-            B = to_array(effect_matrix(self.B, x))
+            effect = to_array(effect_matrix(self.B, x))
         features, selected_inputs, _ = self.features.linearize(states, inputs)
         d = self.residual.linearize(features, selected_inputs, covariance=False)
-        return nominal + (B @ d.mean[..., None])[..., 0]
+        return nominal + (effect @ d.mean[..., None])[..., 0]
 
     def linearize(
         self, states: Array, inputs: Array, covariance: bool = True
@@ -325,13 +325,13 @@ class ResidualModel(TensorModel):
             inputs: (K, m).
             covariance: Whether the covariances at the points are computed.
         """
-        f0, A, G = self._linearize_nominal(states, inputs)
+        f0, by_state, by_input = self._linearize_nominal(states, inputs)
         features, selected_inputs, slopes = self.features.linearize(states, inputs)
         d = self.residual.linearize(features, selected_inputs, covariance)
-        by_state, by_input = self.features.chain(d.A, d.B, slopes)
+        d_by_state, d_by_input = self.features.chain(d.A, d.B, slopes)
         if callable(self.B):
             effect, slopes_of_effect = self._linearize_effect(states)
-            A = A + (slopes_of_effect * d.mean[:, None, :, None]).sum(2)
+            by_state = by_state + (slopes_of_effect * d.mean[:, None, :, None]).sum(2)
         else:
             effect = self._constant_effect
         V = None
@@ -339,8 +339,8 @@ class ResidualModel(TensorModel):
             V = effect @ d.covariance @ effect.swapaxes(-1, -2)
         return Linearized(
             mean=f0 + (effect @ d.mean[..., None])[..., 0],
-            A=A + effect @ by_state,
-            B=G + effect @ by_input,
+            A=by_state + effect @ d_by_state,
+            B=by_input + effect @ d_by_input,
             covariance=V,
         )
 
@@ -360,10 +360,10 @@ class ResidualModel(TensorModel):
 
     def _linearize_effect(self, states: Array) -> tuple[Array, Array]:
         """Computes B (K, n, k) and its derivatives by the state (K, n, k, n)."""
-        B, dB = linearize_function(cast(Any, self.B), self, states)
-        if B.ndim == 2:  # one output
-            return B[..., None], dB[:, :, None]
-        return B, dB
+        effect, slopes = linearize_function(cast(Any, self.B), self, states)
+        if effect.ndim == 2:  # one output
+            return effect[..., None], slopes[:, :, None]
+        return effect, slopes
 
     @cached_property
     def _constant_effect(self) -> Array:
@@ -439,11 +439,11 @@ def train_residual(
     warn_of_transitions(transitions)
     warn_of_turns(transitions, angles)
     training = trainer.fit(
-        data.features,
-        data.targets,
-        len(features.inputs),
-        "value",
-        seed,
+        features=data.features,
+        targets=data.targets,
+        input_dim=len(features.inputs),
+        predicts="value",
+        seed=seed,
         columns=describe_columns(transitions, B, features),
     )
     model = ResidualModel(

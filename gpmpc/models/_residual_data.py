@@ -16,7 +16,7 @@ from gpmpc._functions import call
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp import Transitions
-from gpmpc.gp._data_checks import RESOLUTION, Columns, signal_names
+from gpmpc.gp._data_checks import RESOLUTION, ColumnDescriptions, signal_names
 from gpmpc.models._casadi_function import CasadiFunction
 from gpmpc.models._features import Features
 from gpmpc.models._nominal import Affine, linearize_function
@@ -138,7 +138,7 @@ def residual_data(
 
 def describe_columns(
     transitions: Transitions, B: Effect, features: Features
-) -> Columns:
+) -> ColumnDescriptions:
     """Describes features and targets of a residual: their names and magnitudes.
 
     A residual is the difference of two states, seen through the pseudo-inverse of B,
@@ -154,7 +154,7 @@ def describe_columns(
     steps = (pseudo_inverse @ change[..., None])[..., 0]
     deviations = steps.std(dim=0, correction=0)
     deviations = torch.where(deviations > RESOLUTION, deviations, 1.0)
-    return Columns(
+    return ColumnDescriptions(
         features=_feature_names(transitions, features),
         outputs=_output_names(transitions, B, pseudo_inverse),
         magnitudes=magnitudes.detach().numpy(force=True),

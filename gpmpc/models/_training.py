@@ -206,7 +206,7 @@ def _kinematics_of(
 
 
 def _prior_lengthscales(system: System, sine_and_cosine: bool) -> list[float]:
-    """Returns the lengthscales that a GP supposes of columns that never move.
+    """Returns the lengthscales that a GP supposes of constant columns.
 
     One unit, or a tenth of the range of the limits, whichever is less: from one limit
     to the other predictions forget what they know. More would do harm where limits are

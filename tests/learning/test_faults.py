@@ -215,7 +215,7 @@ def test_a_flight_keeps_its_own_numbers():
         state[:] = states[k + 1]
         input[:] = inputs[k]
         learned = learn_from_step(learned, input, state)
-    assert np.array_equal(learned.error, expected.error)
+    assert np.array_equal(learned.observed_change, expected.observed_change)
     assert np.array_equal(learned.leads, expected.leads)
 
 

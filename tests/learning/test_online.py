@@ -170,14 +170,14 @@ def test_a_changed_model_is_a_model_with_a_last_innovation(changed):
     x = rng.uniform(-1, 1, (12, 2))
     u = rng.uniform(-1, 1, (12, 1))
     after = np.array([cart(a, b, gain=0.8) for a, b in zip(x, u, strict=True)])
-    seen = [changed.error(*row) for row in zip(x, u, after, strict=True)]
-    noise = np.full(len(seen[0].error), 1e-6)
+    seen = [changed.observe(*row) for row in zip(x, u, after, strict=True)]
+    noise = np.full(len(seen[0].value), 1e-6)
     model = changed
     for point, error, _ in seen[:-1]:
         model = model.with_point(point, error, noise)
     model = model.later(1.0)
     check_model(model, torch.from_numpy(x), torch.from_numpy(u))
-    point, error, _ = model.error(x[-1], u[-1], after[-1])
+    point, error, _ = model.observe(x[-1], u[-1], after[-1])
     larger = model.with_point(point, error, noise)
     innovation = larger.last_innovation()
     query = torch.from_numpy(point[None])
@@ -303,7 +303,7 @@ def test_a_step_is_expected_with_the_noise_of_states_that_no_gp_has():
         input=np.zeros(1),
         next_state=np.zeros(2),
         point=np.zeros(4),
-        error=np.zeros(1),
+        observed_change=np.zeros(1),
         latent_variance=np.zeros(1),
         noise_variance=changed.gp_noise,
     )

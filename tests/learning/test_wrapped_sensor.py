@@ -101,7 +101,7 @@ def test_angles_of_the_cost_alone_are_known_to_learning_as_well():
     at = np.array([3.13, 2.0])
     torque = np.array([1.0])
     errors = [
-        changed.error(at, torque, sensor(moved(at, torque))).error
+        changed.observe(at, torque, sensor(moved(at, torque))).value
         for sensor in (np.array, shown)
     ]
     assert np.allclose(errors[0], errors[1], atol=1e-12)
