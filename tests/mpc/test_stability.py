@@ -11,7 +11,14 @@ from benchmarks.horizons import TANK_GOAL, VOLTAGES, quadruple_tank, true_model
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions
-from gpmpc.models import Affine, DelayedModel, DisturbedModel, KnownModel, linearize
+from gpmpc.models import (
+    Affine,
+    DelayedModel,
+    DisturbedModel,
+    KnownModel,
+    NoisyModel,
+    linearize,
+)
 from gpmpc.mpc import (
     GPMPC,
     Box,
@@ -261,6 +268,10 @@ def test_of_learned_integrators_a_little_growth_does_not_count():
     assert stability.judged
     assert abs(stability.spectral_radius - 1.0) < 1e-3
     assert not stability.warnings
+    noisy = NoisyModel(gp, replace(gp, predicts="value"), [0, 1])
+    judged = loop_of(noisy, Tracking([0.0, 1.0], [0.1]), 10, [0.0]).stability([0.0] * 2)
+    assert judged.spectral_radius == pytest.approx(stability.spectral_radius)
+    assert judged.stable == stability.stable
 
 
 def test_a_mode_that_no_horizon_holds_is_said_to_be_one():
