@@ -89,14 +89,14 @@ def measured(packed: kernels.Packed, size: int, belief: str) -> dict:
     """One moment-matched Jacobian of six GPs over ``size`` points, beside its floor."""
     S = BELIEFS[belief] * (np.eye(STATES) + 0.1)
     asked = packed, np.zeros((1, STATES)), S[None], np.zeros((1, INPUTS)), False, True
-    kernels.moments(*asked)
+    kernels.gp_moments(*asked)
     times = []
     rates = []
     began = time.process_time()
     while time.process_time() - began < TIMES["seconds"] or len(times) < TIMES["least"]:
         rates.append(issue_rate())
         start = time.process_time()
-        kernels.moments(*asked)
+        kernels.gp_moments(*asked)
         times.append(time.process_time() - start)
     middle = float(np.median(times))
     general = instructions(packed, reduced=True) / max(rates)
@@ -105,8 +105,8 @@ def measured(packed: kernels.Packed, size: int, belief: str) -> dict:
         if belief == "wide"
         else instructions(packed, reduced=False) / max(rates)
     )
-    factor = summed(packed.quadratic_forms.inverse_cholesky)
-    centred = summed(packed.quadratic_forms.doubled_E)
+    factor = summed(packed.variance_factors.inverse_cholesky)
+    centred = summed(packed.variance_factors.doubled_E)
     return {
         "N": size,
         "belief": belief,

@@ -63,7 +63,7 @@ def main() -> None:
     S = at.covariance.numpy()[None]
     kernels.linearize_gps(gps, mu, u[None], False, np.zeros(STATES), False)
     kernels.expand_gps(gps, mu, u[None])
-    kernels.moments(gps, mu, S, u[None], derivatives=True)
+    kernels.gp_moments(gps, mu, S, u[None], derivatives=True)
     first = time.perf_counter() - began
     print(
         f"{describe(here)}\nfirst calls of the three kernels: {first:.2f} s (compiled, "
@@ -172,7 +172,7 @@ def linearisation_groups(
         ]
 
     def jacobian():
-        d = kernels.moments(packed, *at, derivatives=True)
+        d = kernels.gp_moments(packed, *at, derivatives=True)
         return [part[0] for part in (d.J, d.dM_dS, d.dM_du, d.dV_dmu, d.dV_dS, d.dV_du)]
 
     frozen = to_gpytorch(gp).requires_grad_(False)
@@ -202,13 +202,19 @@ def linearisation_groups(
     zeros = np.zeros(gp.output_dim)
     groups: list[Group] = [
         {
-            "moments": lambda: [part[0] for part in kernels.moments(packed, *at)[:2]],
+            "moments": lambda: [
+                part[0] for part in kernels.gp_moments(packed, *at)[:2]
+            ],
             "moments, torch": lambda: by_torch(belief.mean, belief.covariance, control),
         },
         {"moments with Jacobians": jacobian},
-        {"moments, diagonal": lambda: kernels.moments(packed, *at, diagonal=True)[:2]},
         {
-            "diagonal with Jacobians": lambda: kernels.moments(
+            "moments, diagonal": lambda: kernels.gp_moments(packed, *at, diagonal=True)[
+                :2
+            ]
+        },
+        {
+            "diagonal with Jacobians": lambda: kernels.gp_moments(
                 packed, *at, diagonal=True, derivatives=True
             )
         },

@@ -12,9 +12,10 @@
 ``gpmpc.propagation._moments`` states the mathematics and serves torch; here the closed
 forms and their derivatives are evaluated for ``Packed`` arrays, on one thread.
 The moments are those of the k latent functions f of x~ = (x, u), with x ~ N(mu, S) and
-u certain, without the prior mean; callers add that (``linearize_gps`` alone takes it),
-the previous state, observation noise or a nearest semidefinite covariance. All but
-``pack`` take H points; every array below has H in front of the shape that is stated.
+u certain. ``linearize_gps`` adds the prior mean and the previous state; of all others
+callers do, as they add observation noise. All but ``pack`` take H points; every array
+below has H in front of the shape that is stated. Kernels trust the types of what they
+are handed: the functions here make it contiguous and float64.
 Nothing is kept between calls: any number of threads may call at once.
 """
 
@@ -41,10 +42,14 @@ __all__ = [
     "Packed",
     "Window",
     "expand_gps",
+    "gp_moments",
     "linearize_gps",
-    "moments",
     "pack",
 ]
+
+
+# of which covariances are solved for together; a multiple of sixteen
+_POINTS_AT_ONCE = 256
 
 
 class Expansion(NamedTuple):
@@ -109,6 +114,27 @@ def linearize_gps(
             f"the model takes states (H, {n}) and inputs (H, {m}); got {x.shape} and "
             f"{u.shape}"
         )
+    if (
+        covariance and H > _POINTS_AT_ONCE
+    ):  # a row of kernels for each would fill memory
+        parts = [
+            linearize_gps(
+                packed,
+                x=x[first : first + _POINTS_AT_ONCE],
+                u=u[first : first + _POINTS_AT_ONCE],
+                covariance=covariance,
+                offset=offset,
+                adds_state=adds_state,
+            )
+            for first in range(0, H, _POINTS_AT_ONCE)
+        ]
+        covariances = [part.covariance for part in parts]
+        return LinearizedGPs(
+            mean=np.concatenate([part.mean for part in parts]),
+            A=np.concatenate([part.A for part in parts]),
+            B=np.concatenate([part.B for part in parts]),
+            covariance=np.concatenate([V for V in covariances if V is not None]),
+        )
     padded = packed.arrays.points.shape[1]
     solve_rows = k * kernel_rows(H) if covariance else 0
     memory = np.empty((2 * (n + m) + 1 + solve_rows) * padded + 8)
@@ -156,7 +182,7 @@ def expand_gps(packed: Packed, x: Array, u: Array) -> Expansion:
     )
     expand_points.unchecked(
         gp=packed.arrays,
-        inverse_cholesky=packed.quadratic_forms.inverse_cholesky,
+        inverse_cholesky=packed.variance_factors.inverse_cholesky,
         x=x,
         u=u,
         out=expansion,
@@ -164,7 +190,7 @@ def expand_gps(packed: Packed, x: Array, u: Array) -> Expansion:
     return expansion
 
 
-def moments(
+def gp_moments(
     packed: Packed,
     mu: Array,
     S: Array,
@@ -193,22 +219,22 @@ def moments(
     m = packed.input_dim
     if S.shape != (H, n, n):
         raise ShapeError(f"S must have shape {(H, n, n)}; got {S.shape}")
-    d = k if derivatives else 0
+    differentiated_outputs = k if derivatives else 0
     evaluated = Moments(
         M=np.zeros((H, k)),
         V=np.zeros((H, k, k)),
         J=np.zeros((H, k, n)),
-        dM_dS=np.zeros((H, d, n, n)),
-        dM_du=np.zeros((H, d, m)),
-        dV_dmu=np.zeros((H, d, k, n)),
-        dV_dS=np.zeros((H, d, k, n, n)),
-        dV_du=np.zeros((H, d, k, m)),
-        dJ_dS=np.zeros((H, d, n, n, n)),
-        dJ_du=np.zeros((H, d, n, m)),
+        dM_dS=np.zeros((H, differentiated_outputs, n, n)),
+        dM_du=np.zeros((H, differentiated_outputs, m)),
+        dV_dmu=np.zeros((H, differentiated_outputs, k, n)),
+        dV_dS=np.zeros((H, differentiated_outputs, k, n, n)),
+        dV_du=np.zeros((H, differentiated_outputs, k, m)),
+        dJ_dS=np.zeros((H, differentiated_outputs, n, n, n)),
+        dJ_du=np.zeros((H, differentiated_outputs, n, m)),
     )
     evaluate_moments.unchecked(
         gp=packed.arrays,
-        forms=packed.quadratic_forms,
+        factors=packed.variance_factors,
         mu=mu,
         S=S,
         u=u,

@@ -19,8 +19,9 @@ sn2_a I)^-1, for a = b. The rest of dV_aa is that of -|L_a^-1 q_a|^2: (8) with t
 weights -2 e_i, e_i = q_i [(K + sn2 I)^-1 q]_i. ``_pair_sums`` takes one pass over the
 N^2 pairs of points of a pair of outputs, from which derivatives are algebra on sums.
 
-P_ij is such a term of a pair; in shapes P is the number of points, padded. D_a is the
-matrix of the n states, D_u that of the m controls.
+``padded`` is the number of points, padded. D_a is the matrix of the n states, D_u that
+of the m controls. Of one output with itself U has the factor E, so that its sums are
+those of beta q less those of e; of two outputs those of e count with the factor zero.
 """
 
 from typing import NamedTuple
@@ -35,10 +36,10 @@ from gpmpc._kernels._rows import (
     add_products,
     multiply_entries,
     project,
-    reduce_variance,
     row_sum,
     second_moments,
     transform,
+    variance_reduction_by_inverse,
 )
 from gpmpc._kernels._simd import exp, load, store, use_widest_registers
 from gpmpc._kernels.linalg import (
@@ -52,23 +53,23 @@ from gpmpc._kernels.linalg import (
 )
 
 
-class _Belief(NamedTuple):
-    """A belief, and the GPs with their points relative to its mean and input."""
+class _CentredGPs(NamedTuple):
+    """GPs whose points are centred at a belief N(mu, S) and an input u."""
 
     gp: GPArrays
     S: ndarray  # (n, n)
-    x: ndarray  # x_i - mu (n, P)
-    u: ndarray  # u_i - u (m, P)
+    nu: ndarray  # x_i - mu (n, padded)
+    input_differences: ndarray  # u_i - u (m, padded)
 
 
-class _OutputTerms(NamedTuple):
+class _CompiledTerms(NamedTuple):
     """Terms of single outputs: vectors over the points, matrices, and sums."""
 
-    z: ndarray  # (k, n, P)
-    Tz: ndarray  # T_a z_ai (k, n, P)
-    q: ndarray  # (k, P)
-    precision_q: ndarray  # (K_a + sn2_a I)^-1 q_a (k, P)
-    weighted: ndarray  # beta q (k, P)
+    z: ndarray  # (k, n, padded)
+    Tz: ndarray  # T_a z_ai; before, |W nu_i|^2 is made here (k, n, padded)
+    q: ndarray  # (k, padded)
+    precision_q: ndarray  # (K_a + sn2_a I)^-1 q_a (k, padded)
+    weighted: ndarray  # beta q (k, padded)
     G: ndarray  # (k, n, n)
     T: ndarray  # (k, n, n)
     half_logdet: ndarray  # 1/2 log|I + S D_a| (k,)
@@ -83,11 +84,13 @@ class _OutputTerms(NamedTuple):
 class _Scratch(NamedTuple):
     """Memory to work in.
 
-    Only G_ab outlives a call: derivatives of a pair read that of its moments.
+    Only G_ab outlives a call: derivatives of a pair read that of its moments. Each
+    function below writes ``row``, ``other_row``, X and Y before it reads them, and
+    ``_add_difference`` F.
     """
 
-    row: ndarray  # (P,)
-    other_row: ndarray  # (P,)
+    row: ndarray  # (padded,)
+    other_row: ndarray  # (padded,)
     G_ab: ndarray  # of the pair of outputs (n, n)
     T_ab: ndarray  # G_ab S (n, n), like those that follow
     F: ndarray  # of (10)
@@ -106,7 +109,7 @@ class _Gradient(NamedTuple):
 
 
 @compiled
-def evaluate_moments(gp, forms, mu, S, u, diagonal, derivatives, out):
+def evaluate_moments(gp, factors, mu, S, u, diagonal, derivatives, out):
     """Writes ``gpmpc._kernels.Moments`` at mu (H, n), S (H, n, n) and u (H, m).
 
     The arrays of ``out`` are full of zeros; those of derivatives are empty where these
@@ -121,26 +124,28 @@ def evaluate_moments(gp, forms, mu, S, u, diagonal, derivatives, out):
     pair = allocate_pair_terms(n, padded)
     scratch = _allocate_scratch(n, padded)
     for h in range(len(mu)):
-        belief = _Belief(gp=gp, S=S[h], x=points[:n], u=points[n : n + m])
+        centred = _CentredGPs(
+            gp=gp, S=S[h], nu=points[:n], input_differences=points[n : n + m]
+        )
         _centre_points(gp.points, mu[h], u[h], points)
         _clear_sums_over_e(terms)
         for a in range(k):
-            _evaluate_output(belief, a, terms, scratch)
+            _evaluate_output(centred, a, terms, scratch)
             out.M[h, a] = terms.M[a]
             multiply_transposed(terms.G[a], terms.first[a], out.J[h, a])
             if derivatives:
-                _differentiate_mean(belief, a, h, terms, scratch, out)
+                _differentiate_mean(centred, a, h, terms, scratch, out)
         for a in range(k):
-            out.V[h, a, a] = _evaluate_variance(gp, forms, a, terms)
+            out.V[h, a, a] = _evaluate_variance(gp, factors, a, terms)
             if derivatives:
-                _differentiate_variance(belief, a, h, terms, scratch, out)
+                _differentiate_variance(centred, a, h, terms, scratch, out)
             for b in range(a, a + 1 if diagonal else k):
                 P_sum = _evaluate_pair(
-                    belief,
+                    centred,
                     a,
                     b,
                     terms,
-                    E=forms.doubled_E[a],
+                    E=factors.doubled_E[a],
                     derivatives=derivatives,
                     pair=pair,
                     scratch=scratch,
@@ -154,7 +159,7 @@ def evaluate_moments(gp, forms, mu, S, u, diagonal, derivatives, out):
                         du=out.dV_du[h, a, b],
                     )
                     _differentiate_pair(
-                        belief, a, b, terms, P_sum, pair, scratch, gradient
+                        centred, a, b, terms, P_sum, pair, scratch, gradient
                     )
                     out.dV_dmu[h, b, a] = gradient.dmu
                     out.dV_dS[h, b, a] = gradient.dS
@@ -163,7 +168,7 @@ def evaluate_moments(gp, forms, mu, S, u, diagonal, derivatives, out):
 
 @njit_inner
 def _allocate_output_terms(k, n, padded):
-    return _OutputTerms(
+    return _CompiledTerms(
         z=aligned_rows(k * n, padded).reshape(k, n, padded),
         Tz=aligned_rows(k * n, padded).reshape(k, n, padded),
         q=aligned_rows(k, padded),
@@ -186,7 +191,7 @@ def _clear_sums_over_e(terms):
     """Writes zeros to the sums over e, which are filled output by output.
 
     Pairs with an output to come read them with the factor zero, which would not stop
-    NaN of the belief before.
+    NaN of the point before.
     """
     terms.e[:] = 0.0
     terms.e_first[:] = 0.0
@@ -210,7 +215,7 @@ def _allocate_scratch(n, padded):
 
 @njit_noalloc
 def _centre_points(points, mu, u, centred):
-    """Writes x_i - mu and u_i - u (n + m, P)."""
+    """Writes x_i - mu and u_i - u (n + m, padded)."""
     n = len(mu)
     for d in range(len(centred)):
         centre = mu[d] if d < n else u[d - n]
@@ -221,52 +226,54 @@ def _centre_points(points, mu, u, centred):
 
 
 @njit_inner
-def _evaluate_output(belief, a, terms, scratch):
-    """Fills the terms of output a, but for ``second`` and the sums over e.
+def _evaluate_output(centred, a, terms, scratch):
+    """Fills the terms of output a, but for ``precision_q``, ``second``, sums over e.
 
     q is E[k_a(x~_i, x~)]; M holds (1), and G' first is J, (2).
     """
     use_widest_registers()
-    gp = belief.gp
-    n = len(belief.S)
+    gp = centred.gp
+    n = len(centred.S)
     log_q = scratch.row
     whiten = scratch.X
     D = gp.inverse_squares[a, :n]
     D_u = gp.inverse_squares[a, n:]
-    whitened = terms.Tz[a]  # W (x_i - mu), until T_a z_ai takes its place
-    # log q_i = log sf2 - 1/2 log|I + S D| - 1/2 |W (x_i - mu)|^2
+    whitened = terms.Tz[a]  # W nu_i, until T_a z_ai takes its place
+    # log q_i = log sf2 - 1/2 log|I + S D| - 1/2 |W nu_i|^2
     #           - 1/2 (u_i - u)' D_u (u_i - u)
-    terms.half_logdet[a] = invert_identity_plus(belief.S, D, whiten, terms.G[a])
+    terms.half_logdet[a] = invert_identity_plus(centred.S, D, whiten, terms.G[a])
     log_q[:] = gp.log_signal[a] - terms.half_logdet[a]
-    transform(whiten, belief.x, whitened)
+    transform(whiten, centred.nu, whitened)
     add_products(np.full(n, -0.5), whitened, whitened, log_q)
-    add_products(D_u * -0.5, belief.u, belief.u, log_q)
+    add_products(
+        D_u * -0.5, centred.input_differences, centred.input_differences, log_q
+    )
     for j in range(0, len(log_q), 8):
         store(terms.q[a], j, exp(load(log_q, j)))
     multiply_entries(gp.weights[a], terms.q[a], terms.weighted[a])
     terms.M[a] = row_sum(terms.weighted[a])
-    product(terms.G[a], belief.S, terms.T[a])
+    product(terms.G[a], centred.S, terms.T[a])
     symmetrize(terms.T[a])
     for d in range(n):
         z = terms.z[a, d]
-        x = belief.x[d]
+        nu = centred.nu[d]
         for j in range(len(z)):
-            z[j] = D[d] * x[j]
+            z[j] = D[d] * nu[j]
     transform(terms.T[a], terms.z[a], terms.Tz[a])
     project(terms.weighted[a], terms.z[a], terms.first[a])
 
 
 @njit_inner
-def _differentiate_mean(belief, a, h, terms, scratch, out):
+def _differentiate_mean(centred, a, h, terms, scratch, out):
     """Writes the derivatives of M_a and J_a at point h: (8) with the weights beta q.
 
     The derivative of M_a by the mean is J_a: the sum writes it once more, and ``first``
-    of the terms as well.
+    of the terms as well, both the same numbers again.
     """
     _differentiate_sum(
         v=terms.weighted[a],
         factor=1.0,
-        belief=belief,
+        centred=centred,
         a=a,
         terms=terms,
         scratch=scratch,
@@ -274,27 +281,27 @@ def _differentiate_mean(belief, a, h, terms, scratch, out):
         second=terms.second[a],
         gradient=_Gradient(dmu=out.J[h, a], dS=out.dM_dS[h, a], du=out.dM_du[h, a]),
     )
-    _differentiate_J(belief, a, terms, out.J[h, a], out.dJ_dS[h, a], out.dJ_du[h, a])
+    _differentiate_J(centred, a, terms, out.J[h, a], out.dJ_dS[h, a], out.dJ_du[h, a])
 
 
 @njit_noalloc
-def _evaluate_variance(gp, forms, a, terms):
+def _evaluate_variance(gp, factors, a, terms):
     """Returns sf2_a - |L_a^-1 q_a|^2 of (4); fills ``precision_q`` of the terms."""
-    reduction = reduce_variance(
-        forms.inverse_cholesky[a], terms.q[a], terms.precision_q[a]
+    reduction = variance_reduction_by_inverse(
+        factors.inverse_cholesky[a], terms.q[a], terms.precision_q[a]
     )
     return np.exp(gp.log_signal[a]) - reduction
 
 
 @njit_noalloc
-def _differentiate_variance(belief, a, h, terms, scratch, out):
+def _differentiate_variance(centred, a, h, terms, scratch, out):
     """Writes the derivatives of -|L_a^-1 q_a|^2 at point h: (8) with weights -2 e."""
     e = scratch.row
     multiply_entries(terms.precision_q[a], terms.q[a], e)
     terms.e[a] = _differentiate_sum(
         v=e,
         factor=-2.0,
-        belief=belief,
+        centred=centred,
         a=a,
         terms=terms,
         scratch=scratch,
@@ -307,7 +314,7 @@ def _differentiate_variance(belief, a, h, terms, scratch, out):
 
 
 @njit_noalloc
-def _differentiate_sum(v, factor, belief, a, terms, scratch, first, second, gradient):
+def _differentiate_sum(v, factor, centred, a, terms, scratch, first, second, gradient):
     """Writes ``factor`` sum_i v_i dlog q_ai, by (8), and returns sum_i v_i.
 
     Fills the sums ``first`` of v_i z_i and ``second`` of v_i z_i z_i'.
@@ -315,22 +322,22 @@ def _differentiate_sum(v, factor, belief, a, terms, scratch, first, second, grad
     dmu = gradient.dmu
     dS = gradient.dS
     du = gradient.du
-    n = len(belief.S)
+    n = len(centred.S)
     v_sum = row_sum(v)
     G = terms.G[a]
-    D = belief.gp.inverse_squares[a, :n]
-    D_u = belief.gp.inverse_squares[a, n:]
+    D = centred.gp.inverse_squares[a, :n]
+    D_u = centred.gp.inverse_squares[a, n:]
     X = scratch.X  # sum_i v_i w_i w_i'
     project(v, terms.z[a], first)
-    project(v, belief.u, du)
+    project(v, centred.input_differences, du)
     second_moments(v, terms.z[a], scratch.other_row, second)
     congruence(G, second, scratch.Y, X)
     multiply_transposed(G, first, dmu)
     for c in range(n):
         dmu[c] *= factor
         for d in range(c + 1):
-            G_D = G[d, c] * D[d] + G[c, d] * D[c]
-            value = factor * (X[c, d] + X[d, c] - v_sum * G_D) / 4
+            twice_G_D = G[d, c] * D[d] + G[c, d] * D[c]  # of the symmetric G' D
+            value = factor * (X[c, d] + X[d, c] - v_sum * twice_G_D) / 4
             dS[c, d] = dS[d, c] = value
     for c in range(len(du)):
         du[c] *= factor * D_u[c]
@@ -338,15 +345,15 @@ def _differentiate_sum(v, factor, belief, a, terms, scratch, first, second, grad
 
 
 @njit_inner
-def _differentiate_J(belief, a, terms, J, dJ_dS, dJ_du):
+def _differentiate_J(centred, a, terms, J, dJ_dS, dJ_du):
     """Writes the derivatives of J = sum_i beta_i q_i w_i, (8) once more.
 
     dJ/dS = 1/2 sum beta q (w w w - three times G'D with w), dJ/du = sum beta q w c'.
     """
-    n, padded = belief.x.shape
+    n, padded = centred.nu.shape
     G = terms.G[a]
-    D = belief.gp.inverse_squares[a, :n]
-    D_u = belief.gp.inverse_squares[a, n:]
+    D = centred.gp.inverse_squares[a, :n]
+    D_u = centred.gp.inverse_squares[a, n:]
     w = aligned_rows(n, padded)
     weighted_w = aligned_rows(1, padded)[0]
     weighted_ww = aligned_rows(1, padded)[0]
@@ -358,8 +365,8 @@ def _differentiate_J(belief, a, terms, J, dJ_dS, dJ_du):
     transform(np.ascontiguousarray(G.T), terms.z[a], w)
     for c in range(n):
         multiply_entries(terms.weighted[a], w[c], weighted_w)
-        project(weighted_w, belief.u, dJ_du[c])
-        for d in range(len(belief.u)):
+        project(weighted_w, centred.input_differences, dJ_du[c])
+        for d in range(len(centred.input_differences)):
             dJ_du[c, d] *= D_u[d]
         for d in range(c + 1):
             multiply_entries(weighted_w, w[d], weighted_ww)
@@ -373,19 +380,20 @@ def _differentiate_J(belief, a, terms, J, dJ_dS, dJ_du):
 
 
 @njit_inner
-def _evaluate_pair(belief, a, b, terms, E, derivatives, pair, scratch):
+def _evaluate_pair(centred, a, b, terms, E, derivatives, pair, scratch):
     """Returns sum_ij P_ij of (4); fills the terms of the pair, and G_ab.
 
-    delta_ij = delta_i + delta_j + (T_ab z_ai) . z_bj is (5), with r of (6).
+    ``E`` is read for a = b alone. delta_ij = delta_i + delta_j + (T_ab z_ai) . z_bj is
+    (5), with r of (6).
     """
-    gp = belief.gp
-    n = len(belief.S)
+    gp = centred.gp
+    n = len(centred.S)
     T_ab = scratch.T_ab
     D_a = gp.inverse_squares[a, :n]
     D_b = gp.inverse_squares[b, :n]
     r = terms.half_logdet[a] + terms.half_logdet[b]
-    r -= invert_identity_plus(belief.S, D_a + D_b, scratch.X, scratch.G_ab)
-    product(scratch.G_ab, belief.S, T_ab)
+    r -= invert_identity_plus(centred.S, D_a + D_b, scratch.X, scratch.G_ab)
+    product(scratch.G_ab, centred.S, T_ab)
     symmetrize(T_ab)
     pair.delta_j[:] = 0.0
     transform(T_ab, terms.z[b], pair.T_z)
@@ -410,32 +418,28 @@ def _evaluate_pair(belief, a, b, terms, E, derivatives, pair, scratch):
 
 
 @njit_inner
-def _differentiate_pair(belief, a, b, terms, P_sum, pair, scratch, gradient):
+def _differentiate_pair(centred, a, b, terms, P_sum, pair, scratch, gradient):
     """Adds the derivatives of sum_ij P_ij to those of V_ab, by (11)."""
     dmu = gradient.dmu
     dS = gradient.dS
     du = gradient.du
-    n = len(belief.S)
+    n = len(centred.S)
     same = a == b
     G_ab = scratch.G_ab
     X = scratch.X
     Y = scratch.Y
-    cross = scratch.cross  # sum_ij R_ij z_ai z_bj', or with P_ij + U_ij for a != b
+    cross = scratch.cross  # sum_ij (P_ij + U_ij) z_ai z_bj'
     twice_dS = scratch.twice_dS  # twice the derivative by S, not yet symmetric
-    D_a = belief.gp.inverse_squares[a, :n]
-    D_b = belief.gp.inverse_squares[b, :n]
-    D_ua = belief.gp.inverse_squares[a, n:]
-    D_ub = belief.gp.inverse_squares[b, n:]
+    D_a = centred.gp.inverse_squares[a, :n]
+    D_b = centred.gp.inverse_squares[b, :n]
+    D_ua = centred.gp.inverse_squares[a, n:]
+    D_ub = centred.gp.inverse_squares[b, n:]
     sums = np.empty((2, n))
     controls = np.empty((2, len(du)))
     # Y = sum_ij P_ij (z_ai + z_bj) (z_ai + z_bj)' + U_ij (z_ai z_bj' + z_bj z_ai')
     second_moments(pair.p_i, terms.z[a], scratch.row, X)
     second_moments(pair.p_j, terms.z[b], scratch.row, Y)
-    for c in range(n):
-        project(pair.g[c], terms.z[b], cross[c])
-        # for a = b, g was summed over R = P + U; for a != b U is added here
-        for d in range(n if not same else 0):
-            cross[c, d] += terms.first[a, c] * terms.first[b, d]
+    _write_cross_moment(pair, terms, a, b, cross)
     for c in range(n):
         for d in range(n):
             Y[c, d] += X[c, d] + cross[c, d] + cross[d, c]
@@ -478,14 +482,29 @@ def _differentiate_pair(belief, a, b, terms, P_sum, pair, scratch, gradient):
         dmu=dmu,
         twice_dS=twice_dS,
     )
-    project(pair.p_i, belief.u, controls[0])
-    project(pair.p_j, belief.u, controls[1])
+    project(pair.p_i, centred.input_differences, controls[0])
+    project(pair.p_j, centred.input_differences, controls[1])
     for c in range(len(du)):
         du[c] += controls[0, c] * D_ua[c] + controls[1, c] * D_ub[c]
     for c in range(n):
         for d in range(c + 1):
             value = dS[c, d] + (twice_dS[c, d] + twice_dS[d, c]) / 4
             dS[c, d] = dS[d, c] = value
+
+
+@njit_noalloc
+def _write_cross_moment(pair, terms, a, b, cross):
+    """Writes sum_ij (P_ij + U_ij) z_ai z_bj'.
+
+    For a = b the pass over the points has summed both. For a != b it has summed P, and
+    U is the product of beta_ai q_ai and beta_bj q_bj, whose sums there are.
+    """
+    n = len(cross)
+    for c in range(n):
+        project(pair.g[c], terms.z[b], cross[c])
+        if a != b:
+            for d in range(n):
+                cross[c, d] += terms.first[a, c] * terms.first[b, d]
 
 
 @njit_noalloc

@@ -20,10 +20,10 @@ import numpy as np
 from gpmpc._compiled import compiled, njit_noalloc
 from gpmpc._kernels._packed import Array
 from gpmpc._kernels._rows import (
+    add_variance_reductions_by_substitution,
     multiply_entries,
     project,
-    reduce_variance,
-    reduce_variances,
+    variance_reduction_by_inverse,
 )
 from gpmpc._kernels._simd import exp, load, store, total, use_widest_registers, zeros
 from gpmpc._kernels.linalg import aligned_rows
@@ -111,14 +111,16 @@ def linearize_points(gp, columns, prior_mean, adds_state, x, u, memory, out):
     squares = memory[d : 2 * d]
     weighted = memory[2 * d]
     wants_covariance = len(out.covariance) > 0
-    # k_a of all points, for covariances: ``count`` rows of each output
-    kernels = memory[2 * d + 1 :]
-    count = len(kernels) // max(outputs, 1)
+    # k_a of all points, for covariances: ``rows_per_output`` rows of each output
+    kernel_values = memory[2 * d + 1 :]
+    rows_per_output = len(kernel_values) // max(outputs, 1)
     for h in range(len(x)):
         _write_differences(gp.points, x[h], u[h], differences, squares)
         for a in range(outputs):
             D = gp.inverse_squares[a]
-            kernel_row = kernels[a * count + h] if wants_covariance else weighted
+            kernel_row = weighted
+            if wants_covariance:
+                kernel_row = kernel_values[a * rows_per_output + h]
             M[h, a] = prior_mean[a] + write_kernel(
                 gp.log_signal[a], D, squares, gp.weights[a], kernel_row, weighted
             )
@@ -133,27 +135,32 @@ def linearize_points(gp, columns, prior_mean, adds_state, x, u, memory, out):
                 A[h, a, a] += 1.0
     if wants_covariance:
         totals = memory[0]  # the first row of differences is not read any more
-        _write_variances(gp, columns, kernels, count, totals, out.covariance)
+        _write_variances(
+            gp, columns, kernel_values, rows_per_output, totals, out.covariance
+        )
 
 
 @njit_noalloc
-def _write_variances(gp, columns, kernels, count, totals, covariance):
+def _write_variances(gp, columns, kernel_values, rows_per_output, totals, covariance):
     """Writes sf2_a - |L_a^-1 k_a|^2 of H points to the diagonals (H, k, k).
 
-    ``kernels`` has ``count`` rows k_a of each output, the first H of them points'. They
-    are overwritten; ``totals`` is a row of P, 16 or more, to work in.
+    ``kernel_values`` has ``rows_per_output`` rows k_a of each output, the first H of
+    them points'. They are overwritten; ``totals`` is a row of P, 16 or more, to work
+    in.
     """
     use_widest_registers()
     H = len(covariance)
     for a in range(len(gp.weights)):
-        rows = kernels[a * count : (a + 1) * count]
-        for h in range(H, count):
+        rows = kernel_values[a * rows_per_output : (a + 1) * rows_per_output]
+        for h in range(H, rows_per_output):
             rows[h, :] = 0.0
         signal = np.exp(gp.log_signal[a])
         # sixteen rows and the columns of L stay in the first cache together
-        for first in range(0, count, 16):
+        for first in range(0, rows_per_output, 16):
             totals[:16] = 0.0
-            reduce_variances(columns[a], gp.size, rows[first : first + 16], totals)
+            add_variance_reductions_by_substitution(
+                columns[a], gp.size, rows[first : first + 16], totals
+            )
             for h in range(first, min(first + 16, H)):
                 covariance[h, a, a] = max(signal - totals[h - first], 0.0)
 
@@ -179,8 +186,14 @@ def expand_points(gp, inverse_cholesky, x, u, out):
             out.M[h, a] = write_kernel(
                 gp.log_signal[a], D, squares, gp.weights[a], kernel_row, weighted
             )
-            reduction = reduce_variance(inverse_cholesky[a], kernel_row, solution)
-            out.variance[h, a] = max(np.exp(gp.log_signal[a]) - reduction, 0.0)
+            reduction = variance_reduction_by_inverse(
+                inverse_cholesky[a], kernel_row, solution
+            )
+            variance = np.exp(gp.log_signal[a]) - reduction
+            if variance < 0.0:  # round-off: it is held at zero, and does not change
+                variance = 0.0
+                solution[:] = 0.0
+            out.variance[h, a] = variance
             # dvar = -2 sum_i [(K_a + sn2_a I)^-1 k_a]_i k_i z_i
             multiply_entries(solution, kernel_row, solution)
             project(solution, differences, sums)

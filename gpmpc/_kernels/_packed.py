@@ -33,7 +33,7 @@ class GPArrays(NamedTuple):
     size: int  #: N
 
 
-class QuadraticForms(NamedTuple):
+class VarianceFactors(NamedTuple):
     """What variances are made of: lower triangles of k matrices in all entries (k, E).
 
     With (K + sn2 I)^-1 = L^-T L^-1.
@@ -71,7 +71,7 @@ class Packed:
         return np.ascontiguousarray(self.cholesky.transpose(0, 2, 1))
 
     @cached_property
-    def quadratic_forms(self) -> QuadraticForms:
+    def variance_factors(self) -> VarianceFactors:
         """The matrices that exact moments and derivatives of the variance read."""
         size = self.arrays.size
         padded = self.arrays.weights.shape[1]
@@ -82,13 +82,13 @@ class Packed:
             beta = self.arrays.weights[a, :size]
             inverse.append(_inverse_by_four_rows(factor, padded))
             doubled_E.append(_doubled_E_by_blocks(factor, beta, padded))
-        return QuadraticForms(
+        return VarianceFactors(
             inverse_cholesky=_aligned_copy(inverse), doubled_E=_aligned_copy(doubled_E)
         )
 
 
 def _inverse_by_four_rows(factor: Array, padded: int) -> Array:
-    """Returns the inverse of a factor as ``QuadraticForms.inverse_cholesky`` (E,)."""
+    """Returns the inverse of a factor as ``VarianceFactors.inverse_cholesky`` (E,)."""
     size = len(factor)
     square = np.zeros((padded, padded))
     square[:size, :size], _ = scipy.linalg.lapack.dtrtri(factor, lower=1)
@@ -99,7 +99,7 @@ def _inverse_by_four_rows(factor: Array, padded: int) -> Array:
 
 
 def _doubled_E_by_blocks(factor: Array, beta: Array, padded: int) -> Array:
-    """Returns beta beta' - (L L')^-1 as ``QuadraticForms.doubled_E`` (E,)."""
+    """Returns beta beta' - (L L')^-1 as ``VarianceFactors.doubled_E`` (E,)."""
     size = len(factor)
     precision, _ = scipy.linalg.lapack.dpotri(factor, lower=1)  # the lower triangle
     square = np.zeros((padded, padded))

@@ -7,7 +7,8 @@ Of two outputs a and b, over i and j,
 
 one pass collects row sums p_i, column sums p_j and g_j = sum_i R_ij z_ai. The weights
 are beta q, and R = P, for a != b. For a = b they are q, P_ij has the factor E_ij and
-runs over i >= j, and R = E q q exp(delta).
+runs over i >= j, and R = E q q exp(delta) = P + U. ``padded`` is the number of points,
+padded.
 
 Four rows i meet sixteen columns j in registers: eight independent chains are what two
 multiply-adds per cycle with a latency of four ask for. Here a0 to a3 are four rows of
@@ -41,13 +42,13 @@ from gpmpc._kernels.linalg import aligned_rows
 class PairTerms(NamedTuple):
     """Terms of one pair of outputs a and b, and the sums over their points."""
 
-    delta_i: ndarray  # r_ab - 1/2 z_ai' T_ab D_b T_a z_ai (P,)
-    delta_j: ndarray  # -1/2 z_bj' T_ab D_a T_b z_bj (P,)
-    T_z: ndarray  # T_ab z_ai (n, P)
-    weighted_z: ndarray  # weight_i z_ai (n, P)
-    p_i: ndarray  # row sums of P (P,)
-    p_j: ndarray  # column sums of P (P,)
-    g: ndarray  # g_j = sum_i R_ij z_ai (n, P)
+    delta_i: ndarray  # r_ab - 1/2 z_ai' T_ab D_b T_a z_ai (padded,)
+    delta_j: ndarray  # -1/2 z_bj' T_ab D_a T_b z_bj (padded,)
+    T_z: ndarray  # T_ab z_ai (n, padded)
+    weighted_z: ndarray  # weight_i z_ai (n, padded)
+    p_i: ndarray  # row sums of P_ij (padded,)
+    p_j: ndarray  # column sums of P_ij (padded,)
+    g: ndarray  # g_j = sum_i R_ij z_ai (n, padded)
 
 
 @njit_inner

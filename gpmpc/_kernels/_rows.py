@@ -111,10 +111,10 @@ def largest_size(row):
 
 
 @njit_noalloc
-def reduce_variance(triangle, q, solution):
+def variance_reduction_by_inverse(triangle, q, solution):
     """Returns |L^-1 q|^2 and writes (K + sn2 I)^-1 q to ``solution``.
 
-    It takes one pass over ``triangle``, L^-1 as ``QuadraticForms.inverse_cholesky``:
+    It takes one pass over ``triangle``, L^-1 as ``VarianceFactors.inverse_cholesky``:
     four entries of v = L^-1 q at a time, times their rows, add up to L^-T v.
     """
     use_widest_registers()
@@ -143,7 +143,7 @@ def reduce_variance(triangle, q, solution):
 
 
 @njit_noalloc
-def reduce_variances(columns, size, q, totals):
+def add_variance_reductions_by_substitution(columns, size, q, totals):
     """Adds |L^-1 q_h|^2 of the rows of q to ``totals``; q is overwritten.
 
     Forward substitution that reads L, of which ``columns[j]`` begins with column j,

@@ -25,9 +25,9 @@ from gpmpc._kernels._gp_point import write_kernel
 from gpmpc._kernels._packed import COLUMNS, Array, GPArrays, aligned
 from gpmpc._kernels._simd import load, store, use_widest_registers
 from gpmpc._kernels.linalg import aligned_rows, four_dots
-from gpmpc.exceptions import DataError, SettingError
+from gpmpc.exceptions import DataError, SettingError, ShapeError
 
-# where a column of L has 1 / L_jj and v_j
+# where a column j of L has 1 / L_jj and v_j: [0 .. 0, L_jj .. L_Nj, .., 1 / L_jj, v_j]
 INVERSE = -2
 V = -1
 
@@ -66,7 +66,7 @@ class Window:
         data = np.zeros((d + 3 * k, 0))
         arrays = GPArrays(
             points=data[:d],
-            inverse_squares=lengthscales**-2.0,
+            inverse_squares=np.ascontiguousarray(lengthscales**-2.0),
             log_signal=np.log(signal_variance),
             weights=data[:k],  # of the shape alone, as N = 0
             size=0,
@@ -103,9 +103,11 @@ class Window:
             point: x~ (d,).
             target: Its targets (k,).
             noise: The variances of its noise (k,).
-            rows: Number of rows of the factor that there are to be; all by default.
+            rows: Number of rows of the factor that there are to be; by default all,
+                also those that were left out before.
 
         Raises:
+            ShapeError: The point, its targets or their noise have another length.
             DataError: An entry is not finite.
             SettingError: The factor does not exist, or has no room for the point.
         """
@@ -117,7 +119,12 @@ class Window:
         P = -(-N // COLUMNS) * COLUMNS
         data = aligned((d + 3 * k, P))
         arrays = self.arrays._replace(points=data[:d], weights=data[-k:], size=N)
-        new = np.concatenate([point, target, noise])
+        shapes = np.shape(point), np.shape(target), np.shape(noise)
+        if shapes != ((d,), (k,), (k,)):
+            rule = f"a point ({d},), targets ({k},) and noise ({k},)"
+            raise ShapeError(f"{rule} are appended; got {shapes}")
+        # the kernel takes any array for one of doubles
+        new = np.concatenate([point, target, noise], dtype=np.float64)
         if not np.isfinite(new).all():
             raise DataError("a point, its targets and their noise must be finite")
         columns = self._columns_to_extend()

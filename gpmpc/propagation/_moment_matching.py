@@ -126,7 +126,7 @@ class MomentMatching(NoisyPropagator):
         mean, covariance, control = arrays
         batch = mean.shape[:-1]
         H = math.prod(batch)
-        matched = kernels.moments(
+        matched = kernels.gp_moments(
             f.packed,
             mu=mean.reshape(H, mean.shape[-1]),
             S=covariance.reshape(H, *covariance.shape[-2:]),

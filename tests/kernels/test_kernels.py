@@ -1,6 +1,7 @@
 """The compiled moments against torch's closed form and its derivatives, 50 digits, and
 finite differences."""
 
+import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -14,10 +15,10 @@ import torch
 from gpmpc import _kernels as kernels
 from gpmpc._kernels import _gp_point, _simd, pack
 from gpmpc._kernels._rows import (
+    add_variance_reductions_by_substitution,
     largest_size,
     largest_square,
-    reduce_variance,
-    reduce_variances,
+    variance_reduction_by_inverse,
 )
 from gpmpc._kernels._simd import NEAR_ZERO, load, store
 from gpmpc.exceptions import DataError, SettingError, ShapeError
@@ -40,11 +41,11 @@ def at_one(kernel, gps, *at, **settings):
 
 
 def valued(gps, *at, **settings):
-    return at_one(kernels.moments, gps, *at, **settings)[:3]
+    return at_one(kernels.gp_moments, gps, *at, **settings)[:3]
 
 
 def differentiated(gps, *at, **settings):
-    return at_one(kernels.moments, gps, *at, derivatives=True, **settings)
+    return at_one(kernels.gp_moments, gps, *at, derivatives=True, **settings)
 
 
 def control(m):
@@ -346,13 +347,13 @@ def test_variances_at_several_points_are_reduced_as_each_alone(size):
 
     @numba.njit
     def alone(triangle, row):
-        return reduce_variance(triangle, row, np.empty_like(row))
+        return variance_reduction_by_inverse(triangle, row, np.empty_like(row))
 
     @numba.njit
     def together(columns, rows, totals):
-        reduce_variances(columns, len(columns), rows, totals)
+        add_variance_reductions_by_substitution(columns, len(columns), rows, totals)
 
-    expected = [alone(mine.quadratic_forms.inverse_cholesky[1], row) for row in q]
+    expected = [alone(mine.variance_factors.inverse_cholesky[1], row) for row in q]
     totals = np.zeros(8)
     together(mine.columns[1], q, totals)
     assert np.allclose(totals, expected, rtol=1e-12, atol=0)
@@ -367,8 +368,8 @@ def test_many_points_are_the_loop_over_them():
     together = [
         kernels.linearize_gps(gps, mu, u, True, np.zeros(3), False),
         kernels.expand_gps(gps, mu, u),
-        kernels.moments(gps, mu, S, u, diagonal=True),
-        kernels.moments(gps, mu, S, u, derivatives=True),
+        kernels.gp_moments(gps, mu, S, u, diagonal=True),
+        kernels.gp_moments(gps, mu, S, u, derivatives=True),
     ]
     for h in range(4):
         alone = [
@@ -379,11 +380,31 @@ def test_many_points_are_the_loop_over_them():
                 )
             ],
             at_one(kernels.expand_gps, gps, mu[h], u[h]),
-            at_one(kernels.moments, gps, mu[h], S[h], u[h], diagonal=True),
+            at_one(kernels.gp_moments, gps, mu[h], S[h], u[h], diagonal=True),
             differentiated(gps, mu[h], S[h], u[h]),
         ]
         for many, one in zip(together, alone, strict=True):
             assert all((a[h] == b).all() for a, b in zip(many, one, strict=True))
+
+
+def test_covariances_of_many_points_are_made_in_parts():
+    gps = packed(model(size=20, n=2, m=1, noise=1e-14))
+    # at its points each variance is a little below zero
+    gps = replace(gps, cholesky=(1 - 1e-6) * gps.cholesky)
+    x = np.tile(gps.arrays.points[:2, :20].T, (100, 1))
+    u = np.tile(gps.arrays.points[2:, :20].T, (100, 1))
+    prior = np.zeros(gps.output_dim)
+    tracemalloc.start()
+    together = kernels.linearize_gps(gps, x, u, True, prior, False)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 2**20  # a row of kernels each would be 1 MiB beside the results
+    alone = kernels.linearize_gps(gps, x[:20], u[:20], True, prior, False)
+    for many, few in zip(together, alone, strict=True):
+        assert (many[-20:] == few).all()
+    expansion = kernels.expand_gps(gps, x[:20], u[:20])
+    for part in (expansion.variance, expansion.dvariance_dx, expansion.dvariance_du):
+        assert not part.any()
 
 
 def test_threads_do_not_disturb_each_other():
@@ -512,8 +533,8 @@ def test_nan_of_one_belief_does_not_reach_the_next():
     mu = np.array([[np.nan, 0.0], [0.2, -0.1]])
     S = np.stack([0.1 * np.eye(2)] * 2)
     u = np.zeros((2, 1))
-    both = kernels.moments(gps, mu, S, u, derivatives=True)
-    alone = kernels.moments(gps, mu[1:], S[1:], u[1:], derivatives=True)
+    both = kernels.gp_moments(gps, mu, S, u, derivatives=True)
+    alone = kernels.gp_moments(gps, mu[1:], S[1:], u[1:], derivatives=True)
     assert np.isnan(both.M[0]).all()
     for name in both._fields:
         value = getattr(both, name)[1]
@@ -528,6 +549,9 @@ def test_a_full_window_refuses_a_further_point():
         window = window.append(point, np.zeros(1), np.full(1, 0.1))
     with pytest.raises(SettingError, match="capacity: of 16 points is used up"):
         window.append(np.array([16.0, 0.0]), np.zeros(1), np.full(1, 0.1))
+    empty = kernels.Window.empty(np.ones((1, 2)), np.ones(1), 1, capacity=16)
+    with pytest.raises(ShapeError, match=r"targets \(1,\) and noise \(1,\)"):
+        empty.append(np.zeros(2), np.zeros(2), np.full(1, 0.1))
 
 
 @pytest.mark.parametrize("part", range(3))
