@@ -1,5 +1,7 @@
 """The figure of a flight says what every line is, in which unit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -101,6 +103,29 @@ def test_steps_that_the_policy_decided_are_marked():
     figure = flight_figure(rollout(2, 1, statuses), pendulum())
     marks = [line for line in figure.axes[0].lines if "failed" in line.get_label()]
     assert [line.get_xdata()[0] for line in marks] == [pytest.approx(0.1)]
+
+
+def test_an_angle_a_turn_from_its_goal_is_on_it():
+    flight = rollout(2, 1)
+    flight = replace(flight, references=flight.states + 2 * np.pi)
+    reference, flown = flight_figure(flight, pendulum()).axes[0].lines
+    assert reference.get_ydata() == pytest.approx(flown.get_ydata())
+
+
+def test_names_of_a_vehicle_are_those_of_its_pose_alone():
+    class Motor(Arm):
+        state_names = ("theta", "psi", "z")
+        input_names = ("U1",)
+
+    kinds = {"theta": "rad", "psi": "Wb", "z": "m", "U1": "V"}
+    figure = flight_figure(rollout(3, 1), System(Motor(), 0.1, units=kinds))
+    assert labels(figure) == ["theta [rad]", "psi [Wb]", "z [m]", "U1 [V]"]
+    flying = System(
+        Motor(), 0.1, units=kinds, pose={"pitch": "theta", "z": "z"}, z_down=True
+    )
+    figure = flight_figure(rollout(3, 1), flying)
+    said = ["pitch [rad]", "psi [Wb]", "z, downwards [m]", "thrust U1 [V]"]
+    assert labels(figure) == said
 
 
 def test_a_flight_of_another_system_is_refused():

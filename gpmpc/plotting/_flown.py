@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from gpmpc._angles import whole_turns
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import ShapeError, check_kind
 from gpmpc.plotting._style import (
@@ -16,11 +17,14 @@ from gpmpc.plotting._style import (
     DASHES,
     GREY,
     ORANGE,
+    broken,
     figure_label,
     legend_below,
     make_figure,
     name_of,
+    names_in_words,
     styled,
+    turns_of,
 )
 
 if TYPE_CHECKING:
@@ -124,16 +128,23 @@ def _draw_states(
     names = [system.state_names[index] for index in panel.indices]
     lines: list[Line2D] = []
     for style, index in zip(_line_styles(len(names)), panel.indices, strict=True):
+        values = rollout.states[:, index]
+        reference = rollout.references[:, index]
+        breaks = np.empty(0, dtype=int)
+        if index in system.angle_indices:
+            # at the turn that is nearest to where the angle was
+            reference = reference + whole_turns(values - reference)
+            breaks = turns_of(reference)
         axis.plot(
-            rollout.times,
-            rollout.references[:, index],
+            broken(rollout.times, breaks),
+            broken(reference, breaks),
             color=GREY,
             linestyle=DASHED,
             linewidth=1,
             label="reference or bound",
         )
-        lines += axis.plot(rollout.times, rollout.states[:, index], **style)
-    _name_lines(axis, lines, names, panel, system.z_down)
+        lines += axis.plot(rollout.times, values, **style)
+    _name_lines(axis, lines, names, panel, system)
 
 
 def _draw_inputs(
@@ -157,7 +168,7 @@ def _draw_inputs(
                     linewidth=1,
                     label="reference or bound",
                 )
-    _name_lines(axis, lines, names, panel, system.z_down)
+    _name_lines(axis, lines, names, panel, system)
 
 
 def _line_styles(count: int) -> list[dict[str, Any]]:
@@ -174,11 +185,12 @@ def _line_styles(count: int) -> list[dict[str, Any]]:
 
 
 def _name_lines(
-    axis: Axes, lines: list[Line2D], names: list[str], panel: _Panel, z_down: bool
+    axis: Axes, lines: list[Line2D], names: list[str], panel: _Panel, system: "System"
 ) -> None:
     """Names a panel of one line by its axis, one of several by words beside them."""
     if len(names) == 1:
-        axis.set_ylabel(name_of(names[0], panel.unit, z_down))
+        words = names_in_words(system.pose, system.z_down)
+        axis.set_ylabel(name_of(names[0], panel.unit, words))
         return
     axis.set_ylabel(f"[{figure_label(panel.unit)}]")
     legend = axis.legend(

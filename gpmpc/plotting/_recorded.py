@@ -30,8 +30,10 @@ from gpmpc.plotting._style import (
     legend_below,
     make_figure,
     name_of,
+    names_in_words,
     plain_numbers,
     styled,
+    turns_of,
 )
 
 if TYPE_CHECKING:
@@ -138,7 +140,7 @@ def _tracked_states(run: "Run") -> list[_Tracked]:
     """
     settings = run.metadata.get("run", {})
     units = run.metadata.get("units", {})
-    z_is_down = run.metadata.get("frames", {}).get("z axis") != "up"
+    words = _names_in_words(run)
     angles = settings.get("angles", "").split()
     tracked_names = [*settings.get("tracked", "").split(), *angles]
     all_names = list(run.state_names)
@@ -158,10 +160,10 @@ def _tracked_states(run: "Run") -> list[_Tracked]:
         unit = units.get(f"state.{name}", "")
         tracked_states.append(
             _Tracked(
-                title=name_of(name, unit, z_is_down),
+                title=name_of(name, unit, words),
                 unit=unit,
                 gaps=gaps_of(run),
-                jumps=_jumps(reference) if name in angles else np.empty(0, int),
+                jumps=turns_of(reference) if name in angles else np.empty(0, int),
                 values=values,
                 reference=reference,
                 expected=mean,
@@ -169,6 +171,12 @@ def _tracked_states(run: "Run") -> list[_Tracked]:
             )
         )
     return tracked_states
+
+
+def _names_in_words(run: "Run") -> dict[str, str]:
+    """Returns what states and inputs of a recording are called in figures."""
+    z_is_down = run.metadata.get("frames", {}).get("z axis") != "up"
+    return names_in_words(run.metadata.get("pose", {}), z_is_down)
 
 
 def _draw_path(axis: Axes, times: np.ndarray, state: _Tracked) -> None:
@@ -219,11 +227,6 @@ def _draw_prediction_error(
     axis.plot(times, state.values - state.expected, color=FLOWN, linewidth=1.0)
 
 
-def _jumps(reference: np.ndarray) -> np.ndarray:
-    """Returns the rows at which the reference of an angle (K,) jumps by a turn."""
-    return np.flatnonzero(np.abs(np.diff(reference)) > np.pi) + 1
-
-
 def _noise_in_words(run: "Run") -> str:
     """Returns which noise the tube of a prediction holds."""
     if "noise_std" in run.metadata.get("run", {}):
@@ -238,6 +241,7 @@ def inputs_figure(run: "Run") -> Figure:
     check_run(run)
     m = len(run.input_names)
     units = run.metadata.get("units", {})
+    words = _names_in_words(run)
     figure, axes = make_figure(
         width=7.2,
         height=1.6 * m + 1.0,
@@ -255,7 +259,7 @@ def inputs_figure(run: "Run") -> Figure:
             label="applied",
         )
         _draw_bounds(axis, values, run.input_bounds[:, i])
-        axis.set_ylabel(name_of(name, units.get(f"input.{name}", "")))
+        axis.set_ylabel(name_of(name, units.get(f"input.{name}", ""), words))
         _mark_failures(run, axis)
     axes[-1, 0].set_xlabel("time [s]")
     legend_below(figure, axes.flat)

@@ -5,7 +5,7 @@ their dashes as well as in their colours, so that a black and white print can be
 """
 
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,10 +44,8 @@ DASHES: tuple[Any, ...] = (
     (0, (8, 2)),
 )
 DASHED = (0, (4, 3))  # of references and bounds
-_NAMES = {
-    "phi": "roll",
-    "theta": "pitch",
-    "psi": "yaw",
+# Inputs of the quadrotor, whose z axis points downwards, in words.
+_INPUTS_IN_WORDS = {
     "U1": "thrust U1",
     "ux": "direction ux",
     "uy": "direction uy",
@@ -77,11 +75,29 @@ def figure_label(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def name_of(name: str, unit: str = "", z_down: bool = True) -> str:
-    """Returns the name of a state or input with its unit, as ``z, downwards [m]``."""
-    full = _NAMES.get(name, figure_label(name))
-    if name == "z" and z_down:
-        full = "z, downwards"
+def names_in_words(pose: Mapping[str, str], z_down: bool) -> dict[str, str]:
+    """Returns what signals of a vehicle are called in figures, by their names.
+
+    Args:
+        pose: Which states say where it is and how it is turned, by x, ..., roll, ...
+        z_down: Whether its z axis points downwards.
+    """
+    words = {
+        state: axis for axis, state in pose.items() if axis in ("roll", "pitch", "yaw")
+    }
+    if z_down and pose:
+        words |= _INPUTS_IN_WORDS
+    if z_down and "z" in pose:
+        words[pose["z"]] = f"{figure_label(pose['z'])}, downwards"
+    return words
+
+
+def name_of(name: str, unit: str = "", words: Mapping[str, str] | None = None) -> str:
+    """Returns the name of a state or input with its unit, as ``z, downwards [m]``.
+
+    ``words`` are those of ``names_in_words``.
+    """
+    full = (words or {}).get(name, figure_label(name))
     unit = figure_label(unit)
     return f"{full} [{unit}]" if unit not in ("", "1", "?") else full
 
@@ -133,6 +149,11 @@ def png(figure: Figure, dpi: int = 150) -> bytes:
 def gaps_of(run: "Run") -> np.ndarray:
     """Returns the rows before which steps are lost."""
     return np.flatnonzero(np.diff(run.steps) != 1) + 1
+
+
+def turns_of(angle: np.ndarray) -> np.ndarray:
+    """Returns the rows at which an angle (K,) jumps by a turn."""
+    return np.flatnonzero(np.abs(np.diff(angle)) > np.pi) + 1
 
 
 def broken(values: np.ndarray, breaks: np.ndarray) -> np.ndarray:

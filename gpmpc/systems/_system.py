@@ -101,7 +101,7 @@ class System:
     #: a trajectory prescribes something other than tracked states
     references: Callable[[Trajectory, int, float], Array] | None = None
     #: states that say where it is in space and how it is turned, by x, y, z, roll,
-    #: pitch, yaw; pictures show it there
+    #: pitch, yaw, in m and rad; pictures show it there
     pose: Mapping[str, str] = field(default_factory=dict)
     #: whether the z axis of that space points downwards
     z_down: bool = False
@@ -185,6 +185,17 @@ class System:
                         key, f"must name states, {', '.join(states)}; got {name!r}"
                     )
         self._check_rates()
+        self._check_pose()
+
+    def _check_pose(self) -> None:
+        """Raises where a pose is in units that pictures in space do not have."""
+        for axis, name in self.pose.items():
+            unit = "m" if axis in ("x", "y", "z") else "rad"
+            if self.units[name] not in (unit, UNKNOWN):
+                raise SettingError(
+                    "pose",
+                    f"must be in m and rad; got {name} [{self.units[name]}] for {axis}",
+                )
 
     def _check_rates(self) -> None:
         """Raises where a state has two rates, or is in the end its own."""

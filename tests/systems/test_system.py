@@ -230,6 +230,11 @@ def test_a_trajectory_gives_the_tracked_states_and_their_rates():
             "nominal: must have the states, inputs and time step .*position",
         ),
         ({"lost": 0.0}, SettingError, "lost: must be a number above 0"),
+        (
+            {"units": {"position": "mm"}, "pose": {"x": "position"}},
+            SettingError,
+            r"pose: must be in m and rad; got position \[mm\] for x",
+        ),
     ],
 )
 def test_misuse_is_refused_where_the_system_is_made(settings, error, message):
