@@ -45,7 +45,7 @@ def calibrate(arguments: argparse.Namespace) -> Result:
     flights = _read_flights(arguments.flights or [path])
     for flight in flights:
         _check_flight(flight, experiment.system, path)
-        if not flight.finished:
+        if condition(flight):
             console.out(f"{flight.path}: {condition(flight)}", highlight=False)
     if not experiment.learns or hasattr(experiment.learning, "episodes"):
         raise DataError(

@@ -34,9 +34,14 @@ _SUFFIXES = {
 
 
 def condition(run: Run) -> str:
-    """Says what is wrong with a recording that is not finished."""
-    reasons = "; ".join(flaw.text for flaw in run.flaws)
-    return reasons if run.whole else f"{CUT} ({reasons})"
+    """Says what a recording lacks, and what ended its flight early; else nothing."""
+    parts = []
+    if not run.finished:
+        reasons = "; ".join(flaw.text for flaw in run.flaws)
+        parts.append(reasons if run.whole else f"{CUT} ({reasons})")
+    if run.ended_by:
+        parts.append(plain_text(f"the flight ended early: {run.ended_by}"))
+    return "; ".join(parts)
 
 
 def log(arguments: argparse.Namespace) -> Result:
@@ -94,7 +99,7 @@ def _export(file: Path, output: Path) -> Result:
     run = _read_steps(file)
     _write(output, _table_file(run, output.suffix))
     note = f"{len(run.times)} rows, {len(run.columns)} columns"
-    if not run.finished:
+    if condition(run):
         note += f"; the recording: {condition(run)}"
     return _written(output, note, run)
 
@@ -154,7 +159,7 @@ def _info(file: Path) -> Result:
 def _state(run: Run) -> str:
     """Returns in words whether a recording is finished and whole."""
     if run.finished:
-        return "finished"
+        return "; ".join(filter(None, ["finished", condition(run)]))
     if run.whole:
         return "whole, as far as can be told"
     if "recovered" in run.metadata:

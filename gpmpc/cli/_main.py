@@ -137,10 +137,10 @@ def _run_with_settings(
         if not arguments.cfg:
             find_modules_here()
         if flies_many and arguments.cfg:
-            raise GpmpcError(
-                "--cfg: shows the settings of one run; leave out -m, and give each "
-                "setting one value"
-            )
+            advice = "leave out -m, and give each setting one value"
+            if name == "tune":
+                advice = "ask gpmpc run --cfg, and give each setting one value"
+            raise GpmpcError(f"--cfg: shows the settings of one run; {advice}")
         if flies_many:
             # Before the libraries load, here and in the processes started from here.
             os.environ |= dict.fromkeys(THREADS, "1")

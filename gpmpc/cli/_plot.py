@@ -31,20 +31,29 @@ def plot(arguments: argparse.Namespace) -> Result:
     """Draws a recorded flight, or every one below a folder."""
     paths = recordings(arguments.run)
     if len(paths) == 1:
-        folder = arguments.to or paths[0].parent / "figures"
-        return Result(_plot(arguments, paths[0], folder))
+        return Result(_plot(arguments, paths[0], _folder_of(arguments, paths[0])))
     plotted = []
     code = 0
     for path in paths:
-        folder = path.parent / "figures"
-        if arguments.to:
-            folder = arguments.to / path.parent.relative_to(arguments.run)
         try:
-            plotted.append(_plot(arguments, path, folder))
-        except (GpmpcError, OSError) as error:  # the others are drawn all the same
-            print_error(one_line(error))
-            code = 2
+            plotted.append(_plot(arguments, path, _folder_of(arguments, path)))
+        except Exception as error:  # the others are drawn all the same
+            if isinstance(error, GpmpcError | OSError):
+                print_error(one_line(error))
+                code = 2
+                continue
+            print_error(f"{path}: {type(error).__name__}: {one_line(error)}")
+            code = max(code, 1)
     return Result({"runs": plotted}, code)
+
+
+def _folder_of(arguments: argparse.Namespace, path: Path) -> Path:
+    """Returns where a recording's figures go: beside it, or as deep below ``--to``."""
+    if arguments.to is None:
+        return path.parent / "figures"
+    if not arguments.run.is_dir():
+        return arguments.to
+    return arguments.to / path.parent.relative_to(arguments.run)
 
 
 def _plot(arguments: argparse.Namespace, path: Path, folder: Path) -> dict[str, Any]:
@@ -68,7 +77,7 @@ def _plot(arguments: argparse.Namespace, path: Path, folder: Path) -> dict[str, 
             for file in _animation_files():
                 animation(run, path=folder / file)
                 written.append(file)
-    note = "" if run.finished else f"; {len(run.times)} steps: {condition(run)}"
+    note = f"; {len(run.times)} steps: {condition(run)}" if condition(run) else ""
     print(f"written to {folder}: {', '.join(written)}{note}")
     return {"folder": str(folder), "written": written, "finished": run.finished}
 

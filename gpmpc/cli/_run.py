@@ -35,6 +35,7 @@ from gpmpc.studies._document import terminal
 from gpmpc.studies._run_folder import (
     RECORDING,
     RunFolder,
+    RunState,
     folder_name,
     of_other_code,
     run_header,
@@ -181,6 +182,10 @@ def run_one(to_fly: RunToFly, wait: bool = True, warn: Warn | None = None) -> Ou
     config = to_fly.config
     folder = to_fly.folder
     settings = plain_settings(config, to_fly.options)
+    if folder.finished and not config.live:  # in a folder that may only be read, too
+        return Outcome(folder.path, folder.result(settings), skipped=True)
+    if wait and folder.state is RunState.RUNNING:
+        print_error(f"waiting for {folder.last_worker}, which flies {folder.path}")
     with writing(folder.path), folder.locked(wait):
         if folder.finished:
             result = folder.result(settings)
@@ -241,11 +246,15 @@ def _fly(to_fly: RunToFly, yaml_text: str, warn: Warn | None) -> dict[str, Any]:
         yaml_text: Its settings, which are put into every recording.
         warn: Called before the flight with each line of what may go wrong in it.
     """
+    began = time.monotonic()
     experiment = experiment_of(to_fly.config)
-    if to_fly.config.recorder != "mcap":
-        return metrics(experiment, run_trial(experiment, warn=warn))
-    recordings = _Recordings(experiment, to_fly, yaml_text)
-    return metrics(experiment, run_trial(experiment, recordings.open_next, warn))
+    open_recording = None
+    if to_fly.config.recorder == "mcap":
+        open_recording = _Recordings(experiment, to_fly, yaml_text).open_next
+    measured = metrics(experiment, run_trial(experiment, open_recording, warn))
+    # Times of files, which would tell it as well, get lost where a folder is copied.
+    measured["times"]["run"] = time.monotonic() - began
+    return measured
 
 
 class _Recordings:

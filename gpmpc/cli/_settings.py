@@ -18,7 +18,12 @@ import gpmpc
 from gpmpc.exceptions import SettingError
 
 # Of files of models, quoted or not.
-_MODEL_ENDINGS = (".safetensors", ".safetensors'", '.safetensors"')
+# Of files of models, those of gpmpc 1 included, in quotes or without.
+_MODEL_ENDINGS = tuple(
+    f"{ending}{quote}"
+    for ending in (".safetensors", ".npz")
+    for quote in ("", "'", '"')
+)
 
 _OWN_FOLDER = "command-line"  # where Hydra says that it found files of --config-dir
 _COMMANDS_OF_RUNS = ("run", "tune")  # whose settings are those of `gpmpc run`

@@ -18,7 +18,7 @@ import shlex
 import threading
 from argparse import Namespace
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,7 +37,7 @@ from gpmpc.cli._overrides import choices, combinations
 from gpmpc.cli._plain_settings import plain_settings
 from gpmpc.cli._settings import search_options
 from gpmpc.cli._terminal import print_error, progress_bar
-from gpmpc.exceptions import SettingError, check_number
+from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.studies._index import RunIndex
 from gpmpc.studies._run_folder import (
     METRICS,
@@ -89,6 +89,8 @@ class Sweep:
         self.flown_again: set[str] = set()
         #: attempts of runs that were ended too often, by folder; they do not fly again
         self.given_up: dict[str, int] = {}
+        #: folders of runs whose result is damaged: another process wrote it so
+        self.unreadable: set[Path] = set()
         self._remarks: set[str] = set()  # that were printed, without their numbers
 
     def close(self) -> None:
@@ -204,7 +206,11 @@ class Sweep:
         self._print_remarks(job.folder.remarks())
         if state is RunState.FAILED:
             return JobOutcome(str(folder), job.folder.error())
-        result = job.folder.result()
+        try:
+            result = job.folder.result()
+        except DataError as error:
+            self.unreadable.add(folder)
+            return JobOutcome(str(folder), str(error))
         fingerprint = self._compared_fingerprint(job, result)
         self._add_to_index(folder / METRICS, result, fingerprint)
         self._index.write()
@@ -331,7 +337,7 @@ def sweep(arguments: Namespace) -> Result:
     first = next(every_run)
     with closing(Sweep(arguments.config_name, first, console)) as runs:
         jobs = _distinct(map(runs.job, itertools.chain([first], every_run)))
-        finished_before = sum(job.folder.finished for job in jobs)
+        finished_before = {job.folder.path for job in jobs if job.folder.finished}
         runs.check(jobs)
         plan = _write_plan(runs.tree, jobs, search_options(runs.config.hydra))
         try:
@@ -345,7 +351,7 @@ def sweep(arguments: Namespace) -> Result:
             if not error.has_launched:
                 raise
             return cannot_go_on(runs.tree, str(error))
-    end = _end_of(jobs, outcomes, finished_before)
+    end = _end_of(jobs, outcomes, finished_before, runs.unreadable)
     text = f"{end.line()}{_count_warnings(runs.warnings)}; in {runs.tree}"
     console.out(text, highlight=False)
     runs.print_other_code()
@@ -409,10 +415,13 @@ class _SweepEnd(NamedTuple):
 
 
 def _end_of(
-    jobs: Sequence[Job], outcomes: Sequence[JobOutcome], finished_before: int
+    jobs: Sequence[Job],
+    outcomes: Sequence[JobOutcome],
+    finished_before: Set[Path],
+    unreadable: Set[Path],
 ) -> _SweepEnd:
     """Counts what is there: another sweep may have flown what failed in this one."""
-    finished = {job.folder.path for job in jobs if job.folder.finished}
+    finished = {job.folder.path for job in jobs if job.folder.finished} - unreadable
     failed = [
         outcome
         for outcome in outcomes
@@ -420,8 +429,8 @@ def _end_of(
     ]
     return _SweepEnd(
         total=len(jobs),
-        finished_before=finished_before,
-        finished_now=len(finished) - finished_before,
+        finished_before=len(finished & finished_before),
+        finished_now=len(finished - finished_before),
         failed=failed,
     )
 

@@ -34,8 +34,9 @@ class Run:
     """
 
     path: Path
-    # Recorded to its end, nothing is missing, and checksums vouch for all of it;
-    # otherwise this is what could be read of it, and ``flaws`` say what is wrong.
+    # The file has its end, nothing is missing, and checksums vouch for all of it;
+    # otherwise this is what could be read of it, and ``flaws`` say what is wrong. Its
+    # flight may have ended early all the same: see ``ended_by``.
     finished: bool
     state_names: tuple[str, ...]
     input_names: tuple[str, ...]
@@ -78,6 +79,16 @@ class Run:
         Where it is not finished all the same, it has no checksums to tell.
         """
         return all(flaw.kind == NO_CHECKSUMS for flaw in self.flaws)
+
+    @property
+    def ended_by(self) -> str:
+        """What ended the flight early, such as an interrupt; empty where nothing did.
+
+        It is empty as well where the file does not tell.
+        """
+        outcome = self.metadata.get("end", {}).get("outcome", "complete")
+        is_complete = outcome.partition(":")[0] == "complete"
+        return "" if is_complete else outcome.strip(": ")
 
     @property
     def lost_steps(self) -> int:

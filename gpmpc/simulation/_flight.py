@@ -80,6 +80,7 @@ class Flight:
         own_states: slice = slice(None),
     ):
         self.steps: list[StepSummary] = []
+        self._commands: list[Array] = []
         self.last: Command | None = None
         self.error: SolverFailure | Diverged | None = None
         self.simulator = simulator
@@ -133,6 +134,7 @@ class Flight:
         if self._on_step is not None:
             self._on_step(step)
         self.steps.append(StepSummary.of(step, far_from_data))
+        self._commands.append(np.array(command.input, dtype=float))
         self.last = command
 
     def _innovation(self, measured: Array) -> Array:
@@ -172,4 +174,5 @@ class Flight:
             suboptimal=tuple(suboptimal),
             far_from_data=tuple(s.step.k for s in summaries if s.far_from_data),
             judgements=tuple(s.judgement for s in summaries),
+            commands=np.array(self._commands),
         )

@@ -22,7 +22,8 @@ class Rollout:
     states: Array  # (K + 1, n) x[0] .. x[K], or the means of the beliefs
     covariances: Array  # (K + 1, n, n) of the beliefs; zero with a plant in the loop
     measured: Array  # (K, n) measurements of x[0] .. x[K-1]
-    inputs: Array  # (K, m) that were applied, u[0] .. u[K-1]
+    # (K, m) that reached the plant, u[0] .. u[K-1], an actuator's noise included
+    inputs: Array
     # (K + 1, n) r[0] .. r[K]; the last one is r[K-1] again where no r[K] was given
     references: Array
     # (K, n) predictions of x[1] .. x[K]; NaN where the plan was not applied
@@ -36,6 +37,8 @@ class Rollout:
     suboptimal: tuple[int, ...] = ()
     far_from_data: tuple[int, ...] = ()  # steps whose plan left the model's data behind
     judgements: tuple[Judgement, ...] = ()  # K, whether it was healthy at every step
+    # (K, m) that were decided, before an actuator's noise; None where nobody tells
+    commands: Array | None = None
 
     @property
     def times(self) -> Array:

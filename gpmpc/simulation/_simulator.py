@@ -222,6 +222,13 @@ class PlantSimulator:
             )
         return self._add_noise("input", np.array(input, dtype=float))
 
+    def _clipped(self, input: Array) -> Array:
+        """Returns an input (m,) as a foreign simulator takes it."""
+        if not self.plant.stateful:
+            return input
+        limits = getattr(self.plant.dynamics, "limits", None)
+        return input if limits is None else np.clip(input, *limits)
+
     def _move_to(self, state: Array, input: Array) -> Diverged | None:
         """Moves to the next state (n,), with noise.
 
@@ -377,7 +384,9 @@ Simulator = PlantSimulator | ModelSimulator
 class Applied(NamedTuple):
     """A step that a simulator has taken."""
 
-    input: Array  # (m,) that reached the plant, an actuator's noise included
+    # (m,) that reached the plant: an actuator's noise included, within the limits that
+    # a foreign simulator clips to
+    input: Array
 
 
 def step_together(
@@ -412,7 +421,7 @@ def step_together(
             states = np.array([simulator.mean for simulator in simulators])
             next_states = step_many(plant, states, np.array(noisy_inputs))
     return [
-        simulator._move_to(state, input) or Applied(input)
+        simulator._move_to(state, input) or Applied(simulator._clipped(input))
         for simulator, state, input in zip(
             simulators, next_states, noisy_inputs, strict=True
         )

@@ -28,7 +28,8 @@ _FEWEST_PAIRS = 6
 class Comparison:
     """Whether group A differs from group B in one measure.
 
-    The p-values are NaN where all differences are equal.
+    The p-values are NaN where all differences are equal; where there are fewer than two
+    pairs, so is every other number.
     """
 
     measure: str
@@ -115,14 +116,13 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         complete, left_out = _drop_gaps(in_both)
         mean_of_a = _mean_by_seed(values_of_a, complete)
         mean_of_b = _mean_by_seed(values_of_b, complete)
+        comparison = _untested(measure, len(mean_of_a), left_out)
         if len(mean_of_a) >= 2:
             comparison = _test(measure, mean_of_a, mean_of_b, left_out)
-            lost = (
-                _lost_without(runs_of_a, measure),
-                _lost_without(runs_of_b, measure),
-            )
-            comparisons.append(replace(comparison, lost=lost))
-    if not comparisons:
+        lost_of_a = _lost_without(runs_of_a, measure)
+        lost_of_b = _lost_without(runs_of_b, measure)
+        comparisons.append(replace(comparison, lost=(lost_of_a, lost_of_b)))
+    if all(comparison.pairs < 2 for comparison in comparisons):
         raise DataError(
             f"{report.tree}: runs of {a} and {b} have fewer than two seeds in common"
         )
@@ -244,6 +244,23 @@ def _test(
     )
 
 
+def _untested(measure: str, pairs: int, left_out: tuple[str, ...]) -> Comparison:
+    """Returns what there is to say of a measure that fewer than two pairs have."""
+    return Comparison(
+        measure=measure,
+        medians=(np.nan, np.nan),
+        quartiles=(np.nan, np.nan, np.nan),
+        difference=np.nan,
+        interval=(np.nan, np.nan),
+        wilcoxon=np.nan,
+        t_test=np.nan,
+        rank_biserial=np.nan,
+        standardised=np.nan,
+        pairs=pairs,
+        left_out=left_out,
+    )
+
+
 def _signed_ranks(differences: np.ndarray) -> np.ndarray:
     """Returns the ranks of the sizes of all differences but zeros, with their signs."""
     nonzero = differences[differences != 0]
@@ -267,12 +284,6 @@ def sentences(
         names = "; ".join(left_out_of_all)
         head += f" Left out, since A or B lacks runs of it: {names}."
     lines = [head]
-    compared = {comparison.measure for comparison in comparisons}
-    lines += [
-        f"{label}: undecided: fewer than two pairs have a number"
-        for measure, label in report.measures.items()
-        if measure not in compared and measure not in _WALL_TIMES
-    ]
     for comparison in comparisons:
         line = _sentence(report.measures[comparison.measure], comparison)
         others = [name for name in comparison.left_out if name not in left_out_of_all]
@@ -286,11 +297,13 @@ def _sentence(label: str, comparison: Comparison) -> str:
     """Returns verdict, medians, differences and tests of one measure."""
     c = comparison
     low, median, high = c.quartiles
-    parts = [
-        f"{label}: {c.verdict}. Medians {c.medians[0]:.4g} and {c.medians[1]:.4g}",
-        f"differences {median:.3g} [{low:.3g}, {high:.3g}]",
-    ]
-    if c.interval[0] != c.interval[1]:
+    parts = [f"{label}: {c.verdict}"]
+    if c.pairs >= 2:
+        parts = [
+            f"{label}: {c.verdict}. Medians {c.medians[0]:.4g} and {c.medians[1]:.4g}",
+            f"differences {median:.3g} [{low:.3g}, {high:.3g}]",
+        ]
+    if c.pairs >= 2 and c.interval[0] != c.interval[1]:
         parts += [
             f"Wilcoxon signed-rank p = {c.wilcoxon:.3g}, "
             f"rank-biserial {c.rank_biserial:.2f}",

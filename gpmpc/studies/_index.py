@@ -179,7 +179,9 @@ class RunIndex:
         changes = content["changes"]
         if not changes.keys() <= base.keys():
             raise ValueError("changes settings that are not there")
-        texts = {key: intern(plain_text(content[key])) for key in _TEXTS}
+        texts: dict[str, Any] = {
+            key: intern(plain_text(content[key])) for key in _TEXTS
+        }
         record = RunRecord(
             choices=_texts_by_name(content["choices"]),
             state=_STATES[content["file"]],
@@ -212,7 +214,7 @@ class RunIndex:
             for key, value in settings.items()
             if value != base[key] or type(value) is not type(base[key])
         }
-        texts = {key: intern(getattr(record, key)) for key in _TEXTS}
+        texts: dict[str, Any] = {key: intern(getattr(record, key)) for key in _TEXTS}
         return RunRecord(
             choices=record.choices,
             state=record.state,

@@ -124,8 +124,11 @@ def _times(flown: Flown) -> dict[str, Any]:
     """Returns the time of the training and quantiles of those of the decisions [s]."""
     training = flown.training
     times: dict[str, Any] = {"training": None if training is None else training.seconds}
+    timings = flown.rollout.timings
+    # Where nobody was asked, such as while a sensor is silent, nobody took time.
+    decided = [timing for timing in timings if timing.total > 0] or timings
     for stage in DECISION_STAGES:
-        seconds = [getattr(timing, stage) for timing in flown.rollout.timings]
+        seconds = [getattr(timing, stage) for timing in decided]
         times[stage] = time_quantiles(np.array(seconds))
     return times
 
@@ -197,12 +200,14 @@ def _violation_rates(
 ) -> dict[str, Any]:
     """Returns how often bounds of inputs and constraints of states were broken.
 
-    Of states the flown ones count, with the sides that a first predicted state has: a
-    constraint of later stages alone asks nothing of them. By name: all boxes are one,
-    "states"; of another kind each constraint is counted for itself.
+    Of inputs those count that were decided: what an actuator's noise adds to them is no
+    decision. Of states the flown ones count, with the sides that a first predicted
+    state has: a constraint of later stages alone asks nothing of them. By name: all
+    boxes are one, "states"; of another kind each constraint is counted for itself.
     """
     lower, upper = problem.inputs.by_stage(horizon)
-    rates = {"inputs": violation_rate(rollout.inputs, lower[0], upper[0])}
+    commands = rollout.inputs if rollout.commands is None else rollout.commands
+    rates = {"inputs": violation_rate(commands, lower[0], upper[0])}
     states = rollout.states[1:]
     constraints = [
         constraint

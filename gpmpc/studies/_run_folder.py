@@ -150,6 +150,22 @@ class RunFolder:
         except FileNotFoundError:
             return None
 
+    @property
+    def seconds(self) -> float | None:
+        """How long the last attempt took [s]; None where none has ended.
+
+        A finished run says so itself; of others, and of older versions' runs, the times
+        of the files tell, which a copy may have lost.
+        """
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            content = json.loads((self.path / METRICS).read_text(encoding="utf-8"))
+            return float(content["times"]["run"])
+        began = self.begun_at
+        ended = self.ended_at
+        if began is None or ended is None or ended < began:
+            return None
+        return 1e-9 * (ended - began)
+
     @contextmanager
     def locked(self, wait: bool = True) -> Iterator[None]:
         """Makes the folder, clears it of half-written files and holds its lock.

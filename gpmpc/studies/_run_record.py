@@ -126,6 +126,13 @@ class RunRecord:
     #: the options of the command by which its settings were found, as typed
     search_options: str = ""
     measures: Mapping[str, float | None] = field(default_factory=dict)
+    #: the folder of the sweep that asked for it, of one that is missing
+    planned_in: Path | None = None
+
+    @property
+    def sweep(self) -> Path | None:
+        """The folder that its own folder is in, or would be."""
+        return self.planned_in if self.folder is None else self.folder.parent
 
     def setting(self, key: str) -> str:
         """Returns the value of a setting that was not chosen; empty if unknown."""
@@ -150,6 +157,7 @@ class RunRecord:
     def row(self) -> dict[str, Any]:
         """Returns its columns in ``Report.runs`` but for cell and seed."""
         columns = {name: getattr(self, name) for name in _COLUMNS}
+        columns["sweep"] = self.sweep
         return columns | {name: self.measures.get(name) for name in MEASURES}
 
 

@@ -55,7 +55,8 @@ class Report:
       (it cannot be read);
     - the measures, NaN where the run has none;
     - ``lost``, ``suspicious`` (at its end) and ``error``: since when and why;
-    - ``folder``; ``unit`` of the errors; ``settings`` by dotted key;
+    - ``folder``, and ``sweep``, which it is in, or would be; ``unit`` of the errors;
+      ``settings`` by dotted key;
     - ``origin``: date, commit and machine; ``code``: names the code that made it, ""
       where there is none or it does not tell;
     - ``search_options``: those of the command by which its settings were found.
@@ -118,14 +119,16 @@ class Report:
     def commands(self) -> list[str]:
         """Returns the commands that fly what is missing or failed, one a cell.
 
-        There are more of a cell whose settings were found in several ways, or where
+        Each run flies into the folder that it is in, or was asked for in. There are
+        more of a cell whose runs are of several, whose settings were found in several
+        ways, or where
         some runs name their seed and some have the usual one. Skipped runs are not
         among them: a run is not flown over what lies in its folder.
         """
         to_fly = self.runs[self.runs.state.isin(("missing", "failed"))]
         commands = []
-        groups = to_fly.groupby(["cell", "search_options", "names_seed"])
-        for (cell, options, names_seed), runs in groups:
+        groups = to_fly.groupby(["cell", "sweep", "search_options", "names_seed"])
+        for (cell, sweep, options, names_seed), runs in groups:
             varied = dict(zip(self.variables, self.cells[cell], strict=True))
             choices = {
                 key: value
@@ -141,7 +144,7 @@ class Report:
             ]
             if names_seed:
                 words.append(f"{SEED}={','.join(runs.seed)}")
-            words.append(folder_override(self.tree))
+            words.append(folder_override(sweep))
             commands.append(plain_text(shlex.join(words)))
         return commands
 
@@ -194,7 +197,7 @@ def _read_files(tree: Path) -> _Files:
         index.write()
     for path in paths.plans:
         try:
-            files.planned += _planned_runs(_read_json(path))
+            files.planned += _planned_runs(_read_json(path), path.parent)
         except READ_ERRORS as error:
             files.skipped.append(_why_skipped(path, "sweep", error))
             files.unread_folders.add(path.parent.name)
@@ -231,11 +234,11 @@ class _Paths:
         )
 
 
-def _planned_runs(plan: Any) -> list[RunRecord]:
+def _planned_runs(plan: Any, folder: Path) -> list[RunRecord]:
     """Returns the runs that a sweep asked for, from the content of its plan."""
     options = intern(plain_text(plan.get("search_options", "")))
     return [
-        RunRecord(parsed(choices), "missing", search_options=options)
+        RunRecord(parsed(choices), "missing", search_options=options, planned_in=folder)
         for choices in plan["runs"]
     ]
 

@@ -80,8 +80,8 @@ class _Environment(Simulator):
         action = np.clip(input, *self.limits).astype(
             self.environment.action_space.dtype
         )
-        observation, _, terminated, _, _ = self.environment.step(action)
-        return self._state(observation), bool(terminated)
+        observation, _, terminated, truncated, _ = self.environment.step(action)
+        return self._state(observation), bool(terminated or truncated)
 
     def _set(self, state: Array) -> bool:
         """Sets a MuJoCo environment to a state."""

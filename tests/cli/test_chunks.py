@@ -16,8 +16,8 @@ from gpmpc.cli._chunks import Chunk, Chunking, Job, fly_chunk
 from gpmpc.cli._composing import Composer
 from gpmpc.cli._examples import Examples
 from gpmpc.cli._overrides import choices, combinations
-from gpmpc.cli._settings import settings_folders
-from gpmpc.cli._sweep import Sweep, _Ends
+from gpmpc.cli._settings import model_file, settings_folders
+from gpmpc.cli._sweep import JobOutcome, Sweep, _end_of, _Ends
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.studies._index import RunIndex
 from gpmpc.studies._run_folder import Busy, RunFolder, RunState, folder_name
@@ -245,3 +245,21 @@ def test_what_all_runs_share_has_one_value(word):
     key = re.escape(word.partition("=")[0])
     with pytest.raises(SettingError, match=rf"\A{key}: is one for all runs"):
         combinations(["seed=1,2", word])
+
+
+def test_what_is_gone_or_damaged_is_not_counted_as_flown(tmp_path):
+    """A finished folder goes while others fly, and one holds half a result."""
+    jobs = jobs_of(tmp_path, "seed=range(3)")
+    gone, flown, damaged = (job.folder.path for job in jobs)
+    for path in (flown, damaged):
+        path.mkdir(parents=True)
+        (path / "metrics.json").write_text("{}")
+    outcomes = [JobOutcome(str(flown)), JobOutcome(str(damaged), "it is damaged")]
+    end = _end_of(jobs, outcomes, finished_before={gone}, unreadable={damaged})
+    said = "3 runs: 1 flown, 0 finished before, 1 failed, 1 gone"
+    assert end.line() == said
+
+
+def test_a_model_s_file_is_known_by_its_ending():
+    for name in ("arm.safetensors", "arm.npz", "'my arm.npz'"):
+        assert model_file(f"model={name}") == ["model=saved", f"model.path={name}"]

@@ -17,6 +17,7 @@ from gpmpc.exceptions import SettingError
 from gpmpc.mpc import Box
 from gpmpc.recording import read_run
 from gpmpc.step import Step
+from gpmpc.studies import _run_folder
 from gpmpc.studies._run_folder import RunFolder, RunState
 from gpmpc.systems import translational
 
@@ -62,6 +63,21 @@ def test_a_live_flight_again_is_finished_when_it_has_ended(tmp_path, monkeypatch
     assert "it ended early" in run_one(live).error
     assert folder.state is RunState.FAILED
     assert during == [RunState.RUNNING] * 4
+
+
+def test_a_run_that_another_process_flies_is_waited_for_and_told(
+    tmp_path, monkeypatch, capsys
+):
+    run = to_fly(tmp_path)
+    monkeypatch.setattr(_run, "_fly", lambda *_: {"times": {"run": 7.5}})
+    monkeypatch.setattr(_run_folder, "is_locked", lambda _: True)
+    run_one(run)
+    assert "gpmpc: waiting for " in capsys.readouterr().err
+    # what a copy of the folder keeps
+    assert run.folder.seconds == 7.5
+    # its numbers are there for who may not write
+    monkeypatch.setattr(RunFolder, "locked", lambda *_: pytest.fail("it writes"))
+    assert run_one(run).skipped
 
 
 def test_a_reader_that_has_seen_enough_makes_no_failed_run(tmp_path, monkeypatch):

@@ -9,6 +9,7 @@ import pytest
 from matplotlib.animation import PillowWriter
 from matplotlib.figure import Figure
 
+from gpmpc.cli import _plot
 from gpmpc.cli._plot import plot
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import animate, inputs_figure, timing_figure, tracking_figure
@@ -136,3 +137,28 @@ def test_an_animation_is_whole_or_as_it_was(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         animate(read_run(tmp_path / "run.mcap"), tmp_path / "flight.gif")
     assert (tmp_path / "flight.gif").read_bytes() == b"old"
+
+
+def test_figures_of_a_tree_lie_below_it_and_an_error_ends_no_other(
+    tmp_path, monkeypatch, capsys
+):
+    """However many runs there are; one run's own folder is no tree."""
+    drawn = []
+
+    def draw(arguments, path, folder):
+        if path.parent.name == "bad":
+            raise ValueError("a colour that nobody knows")
+        drawn.append(folder.relative_to(tmp_path))
+        return {}
+
+    monkeypatch.setattr(_plot, "_plot", draw)
+    arguments = Namespace(run=tmp_path / "tree", to=tmp_path / "to")
+    for name in ("good", "bad"):
+        (tmp_path / "tree" / name).mkdir(parents=True)
+        (tmp_path / "tree" / name / "run.mcap").touch()
+        code = _plot.plot(arguments).code
+    assert (code, [str(folder) for folder in drawn]) == (1, ["to/good", "to/good"])
+    assert "ValueError: a colour that nobody knows" in capsys.readouterr().err
+    arguments.run = tmp_path / "tree" / "good"
+    _plot.plot(arguments)
+    assert str(drawn[-1]) == "to"

@@ -15,6 +15,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
+from gpmpc.cli._log import condition
 from gpmpc.exceptions import RecordingError, SettingError, ShapeError
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.recording import RecordedSystem, _recorder, read_run, replay
@@ -309,6 +310,10 @@ def test_a_run_that_ends_in_an_error_is_recorded_up_to_there(tmp_path):
     run = read_run(path)
     assert len(run.times) == 1
     assert run.metadata["end"]["outcome"] == "ZeroDivisionError: too bad"
+    # the file is whole, and the flight was not
+    assert run.finished
+    assert run.ended_by == "ZeroDivisionError: too bad"
+    assert condition(run) == "the flight ended early: ZeroDivisionError: too bad"
 
 
 def test_a_recorded_step_is_a_copy(tmp_path):

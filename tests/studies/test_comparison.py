@@ -110,6 +110,7 @@ def test_survivors_alone_make_no_group_the_better_one(tmp_path):
     assert rmse.verdict == "undecided: A is smaller than B only where neither was lost"
     text = "\n".join(sentences(report, comparisons, *GROUPS))
     assert "lost, without a number: 4 of A, 0 of B" in text
+    assert text.count("undecided") == 1
     turned = compare(report, *GROUPS[::-1])
     assert next(c for c in turned if c.measure == "rmse").verdict.startswith("undec")
 

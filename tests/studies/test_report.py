@@ -105,6 +105,16 @@ def test_gaps_of_runs_without_a_seed_are_filled_without_one(tmp_path):
         assert report.base_settings() == []
 
 
+def test_gaps_are_filled_in_the_sweep_that_has_them(tmp_path):
+    for name in ("first", "second"):
+        lose(tmp_path / name, ["controller=lqr", f"horizon={len(name)}"])
+    plan(tmp_path / "third", [["controller=lqr", "horizon=9"]])
+    assert read_report(tmp_path).commands() == [
+        f"gpmpc run -m controller=lqr horizon={horizon} folder={tmp_path / name}"
+        for horizon, name in ((5, "first"), (6, "second"), (9, "third"))
+    ]
+
+
 def test_a_failed_run_that_chose_no_seed_flies_again_in_its_folder(tmp_path):
     choices = ["controller=lqr"]
     settings = SETTINGS | {"seed": 0, "options": {"controller": "lqr"}}
@@ -388,7 +398,8 @@ def test_errors_of_both_subsystems_stay_in_their_own_units(tmp_path):
     report = read_report(tmp_path)
     assert "RMSE [m or rad]" in documents(report)["report.md"]
     with pytest.raises(
-        SettingError, match="errors in m and in rad have no common mean; add subsystem="
+        SettingError,
+        match="errors in m and in rad have no common mean; compare runs",
     ):
         compare(report, "controller=lqr", "controller=convex")
     groups = [f"controller={name},subsystem=rotational" for name in ("lqr", "convex")]

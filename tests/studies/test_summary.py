@@ -288,6 +288,17 @@ def test_the_metrics_of_a_flight_are_written_out_in_full():
     assert measured(rollout_of(errors))["times"]["training"] is None
 
 
+def test_commands_and_decisions_are_measured_not_noise_and_silence():
+    """An actuator's noise breaks no bound; who was not asked took no time."""
+    timings = (Timing(), Timing(), Timing(1e-3, 1e-3, 2e-3))
+    rollout = rollout_of(
+        np.zeros((4, 3)), timings=timings, commands=np.full((3, 3), 10.0)
+    )
+    result = measured(replace(rollout, inputs=np.full((3, 3), 10.1)))
+    assert result["violations"]["inputs"]["violations"] == 0
+    assert result["times"]["total"]["median"] == timings[-1].total
+
+
 def test_a_loss_is_dated_by_its_first_step_beyond_the_limit():
     errors = [[0, 0, 0], [0, 0, 9], [0, 0, 12], [0, 40, 0]]
     far = "12 m from its reference, more than 10 m"

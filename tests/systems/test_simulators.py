@@ -173,6 +173,18 @@ def test_an_episode_that_ends_is_a_lost_flight():
         closed_loops(system, Pushing(), np.zeros((3, 2)), None, 2, seeds=2)
 
 
+def test_a_limit_of_steps_that_was_asked_for_ends_the_episode():
+    register_environments()
+    system = gymnasium_system(
+        "gpmpc/double_integrator-v0", time_step=0.1, make={"max_episode_steps": 3}
+    )
+    state = system.dynamics.reset(0)
+    for _ in range(3):
+        assert not system.dynamics.ended
+        state = step(system, state, [0.0])
+    assert system.dynamics.ended
+
+
 def test_mujoco_joints_and_sensors_agree_for_one_and_for_many(cart, rng):
     joints = mujoco_system(cart, ["push"], joints=["slider", "hinge"], substeps=4)
     sensors = mujoco_system(
