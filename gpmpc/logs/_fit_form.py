@@ -1,5 +1,6 @@
 """Fits a form of a model to a log: nominal part, first-order lags, linear term."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -29,6 +30,7 @@ def fit_from(
     model: LogModel,
     log: Log,
     steps: int,
+    choose_penalties: Callable[[LogModel], Array],
     same_log: bool = False,
 ) -> NominalFit:
     """Fits a model but for its GPs.
@@ -39,6 +41,7 @@ def fit_from(
         model: The model, whose parameters are not known yet.
         log: The data.
         steps: Of the rollouts.
+        choose_penalties: Of a linear term, by the model with its nominal part (o,).
         same_log: Whether ``start_from`` was fitted to the same log. Then a linear term
             comes upon its nominal part, where the model has the same.
     """
@@ -48,7 +51,8 @@ def fit_from(
         model = replace(
             model, theta=start_from.theta, time_constants=start_from.time_constants
         )
-        return NominalFit(_fit_term(model, log, steps), standard_errors=np.empty(0))
+        with_term = _fit_term(model, log, steps, choose_penalties(model))
+        return NominalFit(with_term, standard_errors=np.empty(0))
     without_memory = replace(
         model,
         memory=NO_MEMORY,
@@ -60,12 +64,13 @@ def fit_from(
     fitted = replace(
         model, theta=fit.model.theta, time_constants=fit.model.time_constants
     )
-    return replace(fit, model=_fit_term(fitted, log, steps))
+    with_term = _fit_term(fitted, log, steps, choose_penalties(fitted))
+    return replace(fit, model=with_term)
 
 
-def _fit_term(model: LogModel, log: Log, steps: int) -> LogModel:
+def _fit_term(model: LogModel, log: Log, steps: int, penalties: Array) -> LogModel:
     """Fits the linear term of a model by its way of fitting."""
-    fitted = fit_linear_term(model, log, steps)
+    fitted = fit_linear_term(model, log, penalties)
     if not model.refined:
         return fitted
     return refine_linear_term(fitted, log, steps)

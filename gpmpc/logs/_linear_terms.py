@@ -3,7 +3,9 @@
 One step ahead the smallest penalty looks best, since noisy, smoothed and mistimed rows
 explain each other. Many steps ahead it may be useless. So each group of outputs gets
 the penalty with which the rollouts of rows that were left out are best: two halves of
-the log, each of which is rolled out by what the other one taught.
+the log, each of which is rolled out by what the other one taught. They are chosen on
+all rows, once for a structure: chosen by each fold, on fewer rows, they would be others
+than those of the model that is written.
 
 Of noisy rows even the best such fit is biased (errors in variables). ``refine`` goes on
 from it to the weights whose own rollouts are best, by Gauss-Newton steps (the output
@@ -74,18 +76,17 @@ class Moments(NamedTuple):
         return weights
 
 
-def fit_linear_term(model: LogModel, log: Log, steps: int) -> LogModel:
+def fit_linear_term(model: LogModel, log: Log, penalties: Array) -> LogModel:
     """Fits the linear term of a model on what its nominal part leaves.
 
     Args:
         model: With its memory, and the parameters of its nominal part.
         log: The data.
-        steps: Of the rollouts that choose the penalties.
+        penalties: Of each output (o,).
 
     Raises:
         DataError: No piece of the log is long enough.
     """
-    penalties = _choose_penalties(model, log, steps)
     return replace(model, weights=_moments(model, log).weights(penalties))
 
 
@@ -175,8 +176,14 @@ class _RolloutErrors:
         return ((residuals[:-1] - residuals[-1]) / _DIFFERENCE).T
 
 
-def _choose_penalties(model: LogModel, log: Log, steps: int) -> Array:
-    """Chooses the penalty of each output (o,) by rollouts: of all, then by group."""
+def choose_penalties(model: LogModel, log: Log, steps: int) -> Array:
+    """Chooses the penalty of each output (o,) by rollouts: of all, then by group.
+
+    Args:
+        model: With its memory, and the parameters of its nominal part.
+        log: The data.
+        steps: Of the rollouts.
+    """
     o = len(model.history)
     try:
         trials = [_Trial.of(model, *pair, steps) for pair in _halves(log, model.past)]
@@ -215,8 +222,7 @@ class _Trial:
     def of(cls, model: LogModel, log: Log, held_out: Log, steps: int) -> "_Trial":
         """Prepares the trial; raises ``DataError`` where a half is too short.
 
-        Pieces that are too short for so many steps are rolled out to their ends: a
-        penalty is chosen in the folds of a short log as in all of it.
+        Pieces that are too short for so many steps are rolled out to their ends.
         """
         steps = max(min(steps, held_out.longest_piece - model.past - 1), 1)
         windows = held_out.windows(steps, past=model.past, most=_WINDOWS)
@@ -311,23 +317,13 @@ def _halves(log: Log, past: int) -> list[tuple[Log, Log]]:
     """Splits a log in two halves, each of which is left out once.
 
     By run where there are enough runs, else by blocks of time that alternate. What a
-    rollout of a block begins with, the past, may be rows of the block before.
-
-    Returns:
-        The one half, to fit to, and the other one, to roll out.
+    block begins with, the past, is the end of the block before.
     """
-    runs = sorted(log.runs, key=len)
-    with_past = runs
+    runs: Sequence[LogRun] = sorted(log.runs, key=len)
     if len(runs) < _FEW_RUNS:
-        runs = [block for run in log.runs for block in _blocks(run, past=0)]
-        with_past = [block for run in log.runs for block in _blocks(run, past)]
-    return [
-        (
-            replace(log, runs=tuple(runs[fitted::2])),
-            replace(log, runs=tuple(with_past[1 - fitted :: 2])),
-        )
-        for fitted in range(2)
-    ]
+        runs = [block for run in log.runs for block in _blocks(run, past)]
+    halves = [replace(log, runs=tuple(runs[i::2])) for i in range(2)]
+    return [(halves[0], halves[1]), (halves[1], halves[0])]
 
 
 def _blocks(run: LogRun, past: int) -> list[LogRun]:

@@ -70,9 +70,10 @@ class Search:
         seed: Of every random number.
         progress: Called with a line for each structure.
         memory: By the key of a structure without GPs, the parameters of its nominal
-            model by fold (lists of numbers); of any other, its errors. By "simulation
-            of" a key, the logarithms of the errors of its simulations; by "averages of"
-            one, the shares and errors of its corrections.
+            model by fold (lists of numbers), and by "penalties of" it those of its
+            outputs; of any other, its errors. By "simulation of" a key, the logarithms
+            of the errors of its simulations; by "averages of" one, the shares and
+            errors of its corrections.
         for_control: Leaves out what no controller can plan with.
         late: Rows by which inputs are likely to act late.
     """

@@ -4,15 +4,17 @@ Rows that are noisy are smoothed before; a memory filters the noise by itself an
 fitted to them as they are.
 """
 
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from gpmpc._dynamics import Array
 from gpmpc.logs._fit_form import fit_from
 from gpmpc.logs._fitting import PAST, NominalFit
 from gpmpc.logs._folds import Fold
+from gpmpc.logs._linear_terms import choose_penalties
 from gpmpc.logs._log import Log
 from gpmpc.logs._output_gps import train_output_gp
 from gpmpc.logs._smoothing import smooth
@@ -44,8 +46,8 @@ class StructureFits:
         steps: Of the rollouts.
         seed: Of every random number.
         memory: By the key of a structure without GPs, the parameters of its nominal
-            model by fold (lists of numbers). What ``Search`` keeps there stays as it
-            is.
+            model by fold (lists of numbers); by "penalties of" a key, those of its
+            outputs. What ``Search`` keeps there stays as it is.
     """
 
     def __init__(
@@ -86,6 +88,7 @@ class StructureFits:
                     model=structure.model,
                     log=training.log,
                     steps=self._steps,
+                    choose_penalties=self._penalties_of(structure),
                     same_log=parent is not None,
                 ).model
                 for start, training in zip(starts, rows, strict=True)
@@ -196,11 +199,32 @@ class StructureFits:
             sees_memory=gp.sees_past,
         )
 
+    def _penalties_of(self, structure: Structure) -> Callable[[LogModel], Array]:
+        """Returns what chooses the penalties (o,) of a structure: once, on all rows.
+
+        It takes the first model that was fitted but for the linear term.
+        """
+        key = f"penalties of {structure.key}"
+
+        def choose(model: LogModel) -> Array:
+            if key not in self._memory:
+                penalties = choose_penalties(model, self._log, self._steps)
+                self._memory[key] = penalties.tolist()
+            return np.array(self._memory[key])
+
+        return choose
+
     def _fit_nominal_to(self, log: Log, structure: Structure) -> NominalFit:
         """Fits a nominal structure to a log."""
         if not structure.parts:
             start = self._nominal_models[structure.key][0]
-            return fit_from(start, structure.model, log, self._steps)
+            return fit_from(
+                start_from=start,
+                model=structure.model,
+                log=log,
+                steps=self._steps,
+                choose_penalties=self._penalties_of(structure),
+            )
         fits = [self._fit_nominal_to(log, part) for part, _ in structure.parts]
         groups = [groups for _, groups in structure.parts]
         model = combine_models([fit.model for fit in fits], groups)

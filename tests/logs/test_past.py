@@ -14,15 +14,18 @@ from gpmpc.logs import (
     load_learned,
     save_learned,
 )
+from gpmpc.logs._baselines import CONSTANT_STATE
 from gpmpc.logs._fit_form import fit_from
+from gpmpc.logs._folds import split_folds
 from gpmpc.logs._linear_terms import (
-    _choose_penalties,
-    _halves,
+    choose_penalties,
     fit_linear_term,
     refine_linear_term,
 )
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._stability import grows_outside
+from gpmpc.logs._structure_fits import StructureFits
+from gpmpc.logs._structures import additions, bases
 from gpmpc.models import LogModel
 from gpmpc.models._kinematics import Increments
 from gpmpc.models._memory import Memory, Products
@@ -76,6 +79,11 @@ def arx_error(train, windows, order, steps):
     return np.abs(levels[:, -1] - windows.states[:, past + steps, 0]).mean()
 
 
+def fitted_term(model, log):
+    """A model with its linear term."""
+    return fit_linear_term(model, log, choose_penalties(model, log, steps=40))
+
+
 def test_outputs_alone_are_learned_with_their_past(tmp_path):
     train = tanks(0)
     held_out = tanks(1)
@@ -115,29 +123,42 @@ def with_memory(log, memory=ROWS):
 
 def test_noisy_rows_are_fitted_better_on_rollouts_than_one_step_ahead():
     train = tanks(0, noise=0.05)
-    model = fit_linear_term(with_memory(train, Memory(rows=2)), train, steps=40)
+    model = fitted_term(with_memory(train, Memory(rows=2)), train)
     refined = refine_linear_term(model, train, steps=40)
     windows = tanks(1, noise=0.0).windows(40, past=model.past)
     errors = [np.abs(one.rollout_errors(windows)).mean() for one in (model, refined)]
     assert errors[1] < 0.9 * errors[0]
 
 
-def test_penalties_are_chosen_in_folds_of_short_logs_as_in_all_of_them():
-    # Blocks of such a fold are shorter than a rollout of 50 steps with its past.
-    log = tanks(0, rows=280, noise=0.0)
-    model = with_memory(log, Memory(rows=5))
-    # Without noise the least penalty is best.
-    assert _choose_penalties(model, log, steps=50)[0] < 1e-3
-    # Each half is fitted to its own rows, which the other one only begins with.
-    first, second = _halves(log, past=5)
-    fitted = [{t for run in half[0] for t in run.time} for half in (first, second)]
-    assert fitted[0].isdisjoint(fitted[1])
-    assert first[1].windows(34, past=5).times.min() == second[0].runs[0].time[0]
+def test_a_structure_has_the_same_penalties_in_every_fold():
+    log = tanks(0, rows=320, noise=0.0)
+    folds = split_folds(log, past=10, steps=20)
+    base = next(one for one in bases(log, 10) if one.base == CONSTANT_STATE)
+    four_rows = next(one for one in additions(base) if one.reach == 4)
+    structure = base.extended(four_rows)
+    assert structure is not None
+    fits = StructureFits(
+        log=log,
+        folds=folds.parts,
+        kinematics=base.model.kinematics,
+        points=10,
+        steps=20,
+        seed=0,
+        memory={},
+    )
+    penalties = choose_penalties(structure.model, log, steps=20)
+    assert penalties[0] < 1e-2  # less than where none can be chosen: without noise
+    models = [*fits.fit_nominal(structure, parent=None)]
+    models.append(fits.fit_to_all_runs(structure).model)
+    logs = [*(fold.train for fold in folds.parts), log]
+    for model, own in zip(models, logs, strict=True):
+        expected = fit_linear_term(structure.model, own, penalties)
+        np.testing.assert_allclose(model.weights, expected.weights, rtol=1e-6)
 
 
 def test_a_memory_is_what_a_rollout_over_measured_rows_leaves():
     log = tanks(0, rows=60, noise=0.0)
-    model = fit_linear_term(with_memory(tanks(0)), tanks(0), steps=40)
+    model = fitted_term(with_memory(tanks(0)), tanks(0))
     windows = log.windows(1, past=model.past)
     features, residuals = model.nominal_residuals(windows, slice(0, model.past))
     memory = np.tile(features[:, 0], (1, 4))
@@ -165,7 +186,8 @@ def test_first_order_lags_come_back(time_constant):
     kinematics = Increments(log.space)
     affine = AffineNominal(kinematics)
     model = LogModel(kinematics, affine, np.empty(0), (0,), time_constants=np.zeros(1))
-    (fitted,) = fit_from(model, model, log, steps=50).model.time_constants
+    fit = fit_from(model, model, log, 50, choose_penalties=lambda _: np.empty(0))
+    (fitted,) = fit.model.time_constants
     assert abs(fitted - time_constant) < 0.3 * time_constant
     named = replace(model, nominal=Pull())
     fit = fit_nominal(named, None, log, steps=50).model
@@ -201,7 +223,7 @@ def test_products_of_past_rows_learn_a_stiffening_spring():
     windows = held_out.windows(60, past=2)
     rmse = []
     for one in (Memory(rows=1), memory):
-        model = fit_linear_term(with_memory(train, one), train, steps=40)
+        model = fitted_term(with_memory(train, one), train)
         rmse.append(np.sqrt(np.square(model.rollout_errors(windows)).mean()))
     assert rmse[1] < 0.02 * rmse[0]
     # Outside of the data products stand still, and the linear part decides.
