@@ -9,7 +9,6 @@ from gpmpc.export._filter import Estimator, filter_definitions
 from gpmpc.export._functions import FunctionWriter
 from gpmpc.export._text import Numbers, comment, integers
 from gpmpc.mpc import GPMPC
-from gpmpc.mpc._novelty import data_scales
 
 Array = np.ndarray
 
@@ -160,7 +159,7 @@ def _flags(controller: GPMPC, numbers: Numbers, on_failure: str) -> dict[str, bo
         "GPMPC_FEEDBACK": settings.feedback,
         "GPMPC_ROLLS_OUT": controller.prediction.rolls_out,
         "GPMPC_HELD": settings.is_held,
-        "GPMPC_KNOWS_RANGES": data_scales(controller.prediction.model) is not None,
+        "GPMPC_KNOWS_RANGES": controller.data_scales is not None,
         "GPMPC_ESTIMATES": settings.disturbance_gain > 0,
         "GPMPC_HOLDS": on_failure == "hold",
     }
@@ -198,7 +197,7 @@ def _optional_tables(controller: GPMPC, numbers: Numbers) -> list[str]:
     prediction = controller.prediction
     constraints = prediction.constraints
     parts = []
-    scales = data_scales(prediction.model)
+    scales = controller.data_scales
     if scales is not None:
         note = "of the states in the data (n,)"
         parts.append(numbers.table("data_ranges", scales.ranges, note))

@@ -323,6 +323,7 @@ static void guess_inputs(gpmpc_controller *controller)
 static void estimate_disturbance(gpmpc_controller *controller, const real *state)
 {
     real mean[GPMPC_STATES];
+    real error[GPMPC_STATES];
     int i, a;
     if (!controller->has_plan) {
         fill(controller->disturbance, 0, n);
@@ -331,13 +332,16 @@ static void estimate_disturbance(gpmpc_controller *controller, const real *state
     model(controller->means[0], controller->problem.previous_input,
           &controller->problem.work, mean, 0, 0);
     for (i = 0; i < n; i++) {
-        real error = state[i] - mean[i];
+        error[i] = state[i] - mean[i];
         for (a = 0; a < GPMPC_STATE_ANGLE_COUNT; a++)
             if (state_angles[a] == i)
-                error -= whole_turns(error);
-        controller->disturbance[i] +=
-            GPMPC_DISTURBANCE_GAIN * (error - controller->disturbance[i]);
+                error[i] -= whole_turns(error[i]);
     }
+    if (!all_finite(error, n)) /* the model has no numbers there */
+        return;
+    for (i = 0; i < n; i++)
+        controller->disturbance[i] +=
+            GPMPC_DISTURBANCE_GAIN * (error[i] - controller->disturbance[i]);
 }
 
 #if GPMPC_TUBES
@@ -480,7 +484,8 @@ static void riccati(const real *A, const real *B, const real *Q, const real *R,
     fill(K, 0, m * size);
     add_transposed_product(PB, A, size, m, size, K);
     copy(D, factor, m * m);
-    (void)solve_positive(factor, m, K, size);
+    if (!solve_positive(factor, m, K, size))
+        fill(K, 0, m * size); /* no feedback where no gain can be told */
     if (!Q)
         return;
     product(B, K, size, m, size, closed);
@@ -1257,16 +1262,22 @@ static int find_rows_that_give_way(const real *misses, int *gives_way)
     return count;
 }
 
+#define NO_MOMENT REAL(1e-6) /* share of its terms below which a sum is rounding */
+
 /* Whether rows that give way are missed early on the horizon rather than late. */
 static int are_kept_again(const real *misses, const int *gives_way)
 {
     real moment = 0;
+    real size = 0; /* of its terms */
     int k, e;
     for (k = 0; k < H; k++)
         for (e = 0; e < r; e++)
-            if (gives_way[e])
-                moment += (k - REAL(0.5) * (H - 1)) * larger(0, misses[k * r + e]);
-    return moment <= 0;
+            if (gives_way[e]) {
+                real term = (k - REAL(0.5) * (H - 1)) * larger(0, misses[k * r + e]);
+                moment += term;
+                size += absolute(term);
+            }
+    return moment <= NO_MOMENT * size;
 }
 
 /* Price of a row that does not count: it keeps its place among the others. */
@@ -1453,6 +1464,10 @@ static void solve_elastic(gpmpc_controller *controller)
     write_misses(problem, without, misses);
     limits = limits_of_price(problem, misses, gives_way, kept_again,
                              cost_of_plan(problem, states, inputs), guess_cost);
+    if (limits.lowest_price >= highest) { /* the exact one is no dearer */
+        set_elastic_price(problem, gives_way, highest);
+        return;
+    }
     if (!problem->has_feedback)
         write_gains(problem);
     affordable_cost = INFINITY;
@@ -1538,6 +1553,40 @@ static void close_defects(gpmpc_controller *controller)
 }
 #endif
 
+#if GPMPC_ROLLS_OUT
+/* Takes the plan of the solution, rolled out where all functions are finite there; else
+   as the program sees it, with the rows of the guess. */
+static void take_rolled_out(gpmpc_controller *controller,
+                            const gpmpc_reference *reference)
+{
+    gpmpc_problem *problem = &controller->problem;
+    real *states = &problem->states[0][0];
+    real *inputs = &problem->inputs[0][0];
+#if GPMPC_SMOOTH || GPMPC_OUTPUTS
+    real guessed_states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
+    real guessed_inputs[GPMPC_SIZE];
+    int is_finite_there = 1;
+    copy(states, guessed_states, (H + 1) * n);
+    copy(inputs, guessed_inputs, H * m);
+#else
+    (void)reference;
+#endif
+    expand(problem, controller->candidate.x, inputs, states);
+    close_defects(controller);
+#if GPMPC_SMOOTH || GPMPC_OUTPUTS
+#if GPMPC_OUTPUTS
+    is_finite_there = write_outputs(problem, reference);
+#endif
+    if (is_finite_there && write_rows(problem, reference))
+        return;
+    copy(guessed_states, states, (H + 1) * n);
+    copy(guessed_inputs, inputs, H * m);
+    (void)write_rows(problem, reference);
+    expand(problem, controller->candidate.x, inputs, states);
+#endif
+}
+#endif
+
 /* Makes the problem at the states and inputs that the dynamics are linearised at.
    Returns whether all functions are finite. */
 static int write_local_problem(gpmpc_controller *controller, const real *covariance,
@@ -1616,12 +1665,10 @@ static int decide(gpmpc_controller *controller, const real *state,
     status = solution->status;
     if (!is_usable(controller))
         return status;
-    expand(problem, solution->x, &problem->inputs[0][0], &problem->states[0][0]);
 #if GPMPC_ROLLS_OUT
-    close_defects(controller);
-#if GPMPC_SMOOTH
-    (void)write_rows(problem, reference);
-#endif
+    take_rolled_out(controller, reference);
+#else
+    expand(problem, solution->x, &problem->inputs[0][0], &problem->states[0][0]);
 #endif
     *applicable = status == GPMPC_SOLVED || keeps_hard_rows(problem, FEASIBLE);
 #if GPMPC_ROLLS_OUT || !GPMPC_IS_FLOAT

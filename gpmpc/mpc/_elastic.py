@@ -50,6 +50,7 @@ SHARE = 0.1
 TRIALS = 5  # prices between the lowest and the exact one
 NO_PRICE = 1e-9  # of a row that does not count: it keeps its place among the others
 _LOWEST = 2.0**-8  # of the safe price, where violations grow along the horizon
+_NO_MOMENT = 1e-6  # share of its terms below which a sum is rounding
 _TINY = 1e-12
 
 
@@ -125,7 +126,8 @@ def are_kept_again(violations: Array) -> bool:
     """Returns whether rows are missed (H, r) early on the horizon rather than late."""
     by_stage = violations.sum(axis=1)
     centred_stages = np.arange(len(by_stage)) - (len(by_stage) - 1) / 2
-    return bool(centred_stages @ by_stage <= 0.0)
+    terms = centred_stages * by_stage
+    return bool(terms.sum() <= _NO_MOMENT * np.abs(terms).sum())
 
 
 def _rounded(price: float) -> float:

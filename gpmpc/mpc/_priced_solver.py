@@ -75,23 +75,19 @@ class PricedSolver:
         """
         solution = self._solve_at(program, warm_start, self.row_prices)
         constraints = self._prediction.constraints
-        may_give_way = constraints.any_elastic and self._prices_are_exact
-        if self._price_is_due and may_give_way and solution.status.solved:
+        if self._price_is_due and constraints.any_elastic and solution.status.solved:
+            self._price_is_due = False
             planned = local.with_solution(program, solution.x, self._request)
             violations = planned.row_violations()
-            gives_way = constraints.elastic & (violations.max(axis=0) > KEPT)
+            is_exact = self.row_prices == constraints.prices
+            is_missed = violations.max(axis=0) > KEPT
+            gives_way = constraints.elastic & is_exact & is_missed
             if gives_way.any():
                 solution = self._solve_elastic(
                     program, local, solution, gives_way, violations
                 )
-        self._price_is_due = False
         self._is_first = False
         return solution
-
-    @property
-    def _prices_are_exact(self) -> bool:
-        """Whether no elastic row has got another price yet."""
-        return self.row_prices is self._prediction.constraints.prices
 
     def _solve_at(
         self,
@@ -157,7 +153,10 @@ class PricedSolver:
             Q=self._prediction.problem.cost.Q,
             largest_weight=self._prediction.problem.largest_weight,
         )
-        if self._is_first and request.last_plan is not None:
+        if limits.lowest_trial_price >= self._highest_exact_price(gives_way):
+            return exact
+        is_on_the_way = self._is_first and request.last_plan is not None
+        if is_on_the_way and not self._stopwatch.is_late:
             free_cost = self._cost_when_followed(program, local, free)
             if math.isfinite(free_cost + limits.affordable_extra_cost):
                 return self._solve_at_highest_price(
@@ -183,8 +182,8 @@ class PricedSolver:
         affordable_cost = free_cost + limits.affordable_extra_cost
         if self._cost_when_followed(program, local, exact) <= affordable_cost:
             return exact
-        unaffordable_price = float(self._prediction.constraints.prices[gives_way].max())
-        affordable_price = min(limits.lowest_trial_price, unaffordable_price)
+        unaffordable_price = self._highest_exact_price(gives_way)
+        affordable_price = limits.lowest_trial_price
         best = None
         for _ in range(TRIALS):
             if self._stopwatch.is_late:
@@ -224,7 +223,12 @@ class PricedSolver:
     def _lowered(self, gives_way: Array, price: float) -> Array:
         """Returns prices (r,) of which some rows have a lower one than the exact."""
         exact_prices = self._prediction.constraints.prices
-        return np.where(gives_way, np.minimum(price, exact_prices), exact_prices)
+        lowered = np.minimum(price, exact_prices)
+        return np.where(gives_way, lowered, self.row_prices)
+
+    def _highest_exact_price(self, gives_way: Array) -> float:
+        """Returns the highest exact price of some rows."""
+        return float(self._prediction.constraints.prices[gives_way].max())
 
     def _cost_when_followed(
         self, program: CondensedProgram, local: LocalProblem, solution: QPSolution

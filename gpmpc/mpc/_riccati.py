@@ -65,7 +65,8 @@ def finite_horizon_lqr(A, B, Q, R, terminal, horizon):
         add_transposed_product(B_k, PB, D)
         add_transposed_product(PB, A_k, K)
         copy_matrix(D, factor)
-        solve_positive(factor, K)
+        if not solve_positive(factor, K):
+            K[:] = 0.0  # no feedback where no gain can be told
         product(B_k, K, closed)
         for i in range(n):
             for j in range(n):

@@ -164,6 +164,15 @@ def narrow_lane():
     return gpmpc(problem, horizon=12, propagator=noisy, feedback=False)
 
 
+def bound_that_ends(penalty):
+    """A bound that has no number where the angle is beyond half a radian."""
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u")
+    value = 0.1 - casadi.sqrt(0.5 - x[0])
+    bound = Inequality(casadi.Function("h", [x, u], [value]), penalty=penalty)
+    return gpmpc(Problem(WEIGHTS, TORQUES, constraints=[bound]))
+
+
 CONTROLLERS = {
     "inputs": lambda: gpmpc(Problem(Tracking([1.0, 0.1], [0.05], penalized="inputs"))),
     "deviations": lambda: gpmpc(
@@ -178,6 +187,8 @@ CONTROLLERS = {
     "states that nothing weighs, in a large unit": lambda: unweighed(2.0**-10),
     "obstacle and energy": obstacle,
     "hard obstacle": lambda: obstacle(None),
+    "hard bound that ends": lambda: bound_that_ends(None),
+    "elastic bound that ends": lambda: bound_that_ends("elastic"),
     "velocity form": lambda: gpmpc(Problem(WEIGHTS, TORQUES), form="velocity"),
     "delay, estimate, angles": delayed,
     "disturbance as a state": disturbed,
