@@ -298,7 +298,7 @@ COMMANDS = {
                 type=Path,
                 nargs="+",
                 metavar="FILE",
-                help="logs: CSV, Parquet, npz, MCAP, ULog",
+                help="logs: CSV and other text, Parquet, npz, .mat, MCAP, ULog, bags",
             ),
             _argument(
                 "--held-out",

@@ -6,8 +6,9 @@ logs -> training and held-out runs -> learned -> judged -> model, report, card
 import argparse
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -21,12 +22,16 @@ from gpmpc.cli._folders import find_modules_here, write_files, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError
 from gpmpc.logs import IdentifiedModel, Judgement, Log
+from gpmpc.logs._fitting import PAST
 from gpmpc.logs._judging import (
     check_held_out,
     check_learned,
     check_train,
     most_steps,
+    most_told_steps,
 )
+from gpmpc.logs._learning import fewest_rows
+from gpmpc.logs._log import LogRun
 from gpmpc.plotting import judgement_figure, png
 from gpmpc.studies._document import Document, Table, number, terminal
 from gpmpc.studies._run_folder import describe_code
@@ -54,14 +59,16 @@ def learn(arguments: argparse.Namespace) -> Result:
     console.print(repr(log))
     for finding in log.findings:
         console.print(f"  {finding.run}: {finding.kind}: {finding.text}")
-    train, held_out = _split(log, arguments.held_out)
-    check_held_out(held_out, arguments.steps)
+    split = _split(log, arguments.held_out)
+    train = split.train
     check_train(train)
+    check_held_out(split.held_out(PAST))
     with writing(folder, "to"):
         folder.mkdir(parents=True, exist_ok=True)
         learned, judgement = _learn_and_judge(
-            arguments, train, held_out, folder=folder, console=console
+            arguments, split, folder=folder, console=console
         )
+        held_out = split.held_out(learned.model.past)
         logs.save_learned(learned, folder / _MODEL)
         report = _report(learned, judgement, train, held_out)
         card = _card(learned, judgement, train, held_out)
@@ -70,6 +77,8 @@ def learn(arguments: argparse.Namespace) -> Result:
         files["card.md"] = card.markdown()
         write_files(folder, files, "to")
     Console().print(terminal(report.tables[:1]))
+    if judgement.steps_not_told:
+        console.print(_not_told(judgement))
     for line in judgement.losses:
         console.print(f"loses: {line}")
     console.print(f"written to {folder}: {_MODEL}, report.html, report.md, card.md")
@@ -111,12 +120,12 @@ def _advice(learned: IdentifiedModel) -> tuple[str, ...]:
 
 def _learn_and_judge(
     arguments: argparse.Namespace,
-    train: Log,
-    held_out: Log,
+    split: "_Split",
     folder: Path,
     console: Console,
 ) -> tuple[IdentifiedModel, Judgement]:
     """Learns with a memory of finished stages, and judges what was learned."""
+    train = split.train
     memory = _FileMemory(folder / "progress.json", _fingerprint(arguments, train))
     if memory.begun_anew:
         console.print(memory.begun_anew)
@@ -135,6 +144,7 @@ def _learn_and_judge(
             memory=memory,
             for_control=arguments.for_control,
         )
+        held_out = split.held_out(learned.model.past)
         try:
             check_learned(learned, held_out, train)
         except DataError as error:
@@ -142,7 +152,12 @@ def _learn_and_judge(
             text = f"{error} ({folder / _MODEL} is written, without a report)"
             raise DataError(text) from error
         longest = min(arguments.steps, most_steps(learned, held_out, train))
-        show(f"judging on held-out runs, at most {longest} steps ahead")
+        told = max(most_told_steps(learned, held_out), 1)
+        words = ""
+        if told < longest:
+            longest = told
+            words = f": {_of_more_than(told)}"
+        show(f"judging on held-out runs, at most {longest} steps ahead{words}")
         steps = {step for step in _JUDGED_STEPS if step <= longest} | {longest}
         judgement = logs.judge(learned, held_out, train, sorted(steps))
     return learned, judgement
@@ -168,20 +183,55 @@ def _fingerprint(arguments: argparse.Namespace, train: Log) -> str:
     return fingerprint(content, arrays)
 
 
-def _split(log: Log, held_out: Sequence[str]) -> tuple[Log, Log]:
-    """Returns the runs to learn from and those to judge on.
+def _of_more_than(steps: int) -> str:
+    """Says why a model is judged so many steps ahead and no more."""
+    return (
+        f"of predictions more than {steps} {'steps' if steps > 1 else 'step'} ahead "
+        "fewer than four follow each other in the held-out rows, too few to tell"
+    )
+
+
+class _Split(NamedTuple):
+    """The rows of a log to learn from, and those to judge on."""
+
+    train: Log
+    held_out_rows: Log
+    #: the run whose last rows are held out; none where whole runs are
+    run: LogRun | None = None
+
+    def held_out(self, past: int) -> Log:
+        """Returns the rows to judge on, with the past from which predictions begin.
+
+        Args:
+            past: Rows that a model looks back on. What comes before the last rows of a
+                run may be of those that were learned from.
+        """
+        if self.run is None:
+            return self.held_out_rows
+        first = len(self.run) - len(self.held_out_rows)
+        first -= max(past, PAST)
+        rows = self.run.part(max(first, 0), len(self.run), "last part")
+        return replace(self.held_out_rows, runs=(rows,))
+
+
+def _split(log: Log, held_out: Sequence[str]) -> _Split:
+    """Splits a log into the runs to learn from and those to judge on.
 
     Where nobody chose, a fifth of the runs is held out, of all lengths: the middle ones
-    of as many groups. Of one run it is the last fifth.
+    of as many groups. Of one run it is the last fifth, or what is left of the rows that
+    learning needs.
     """
     if held_out:
-        return log.split([*held_out])
+        return _Split(*log.split([*held_out]))
     names = [run.name for run in sorted(log.runs, key=len)]
     if len(names) == 1:
-        return log.split_by_time(0.8)
+        (run,) = log.runs
+        rows = max(round(0.8 * len(run)), min(fewest_rows(1), len(run) - 2))
+        return _Split(*log.split_by_time(rows / len(run)), run)
     count = max(len(names) // 5, 1)
     groups = np.array_split(names, count)
-    return log.split([str(group[(len(group) - 1) // 2]) for group in groups])
+    middle = [str(group[(len(group) - 1) // 2]) for group in groups]
+    return _Split(*log.split(middle))
 
 
 class _FileMemory(dict[str, Any]):
@@ -249,12 +299,17 @@ def _report(
     if reasons:
         title = f"This model should not be used: {reasons[0]}"
         lists["Why the model should not be used"] = reasons
+    longest = judgement.steps[-1]
+    if longest < learned.judged_steps[-1]:
+        notes.append(f"Judged {longest} ahead: {_of_more_than(longest)}.")
     if judgement.losses:
         lists["Where the model loses to what costs nothing"] = judgement.losses
     else:
         notes.append(
             "The model loses to no baseline, by more than 2 % and more than chance."
         )
+    if judgement.steps_not_told:
+        notes.append(_not_told(judgement))
     if learned.control is not None:
         lists["For control"] = [*learned.control.warnings, *learned.control.advice]
     runs = ", ".join(run.name for run in held_out)
@@ -275,6 +330,15 @@ def _report(
         notes=notes,
         lists=lists,
         images={"report.png": png(judgement_figure(judgement))},
+    )
+
+
+def _not_told(judgement: Judgement) -> str:
+    """Says at which steps ahead nobody knows whether a model loses."""
+    steps = ", ".join(map(str, judgement.steps_not_told))
+    return (
+        f"{steps} steps ahead: too few held-out rows to tell whether the model loses "
+        "to what costs nothing"
     )
 
 
@@ -436,6 +500,8 @@ def _doubts(learned: IdentifiedModel, judgement: Judgement) -> list[str]:
     """Returns what must not be trusted."""
     nominal = learned.model.nominal
     doubts = [*_reasons_against(learned, judgement)]
+    if judgement.steps_not_told:
+        doubts.append(_not_told(judgement))
     doubts += [
         f"Loses to a baseline: {loss}"
         for loss in judgement.losses

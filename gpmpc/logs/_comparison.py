@@ -2,19 +2,25 @@
 
 Windows that overlap have errors that are alike. So blocks of windows are drawn, each
 longer than a window, and the ratio of the mean errors is computed anew for every draw
-(block bootstrap; Kuensch, 1989).
+(block bootstrap; Kuensch, 1989). Of few independent predictions the draws are too much
+alike: their interval is widened as Student's t distribution is, and of fewer than four
+nothing is said.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
+from scipy.special import ndtri, stdtrit
 
 from gpmpc._dynamics import Array
+from gpmpc.models._windows import Windows
 
 _DRAWS = 400
 _LEVEL = 0.95
 _FEWEST_BLOCKS = 8
+FEWEST_PREDICTIONS = 4  # that do not overlap: fewer tell nothing from chance
 _DIVERGED = 1e100  # error of what is larger, or not finite
 _LARGEST_RATIO = 1e9
 
@@ -25,12 +31,18 @@ class Comparison:
 
     name: str  #: of the other predictor
     ratio: Array  #: (judged steps, groups)
-    low: Array  #: likewise, of the 95 % interval
-    high: Array  #: likewise
+    #: likewise, of the 95 % interval; zero where there are too few rows to tell
+    low: Array
+    high: Array  #: likewise; infinite there
 
 
 def compare(
-    name: str, distances: Array, others: Array, block: int, seed: int
+    name: str,
+    distances: Array,
+    others: Array,
+    block: int,
+    independent: Sequence[float] | Array,
+    seed: int,
 ) -> Comparison:
     """Compares the errors of a model with those of another predictor.
 
@@ -39,6 +51,7 @@ def compare(
         distances: Of the model (W, steps, groups), in the order of time.
         others: Of the other predictor, likewise.
         block: Windows that are drawn together.
+        independent: Number of predictions that do not overlap, by judged step.
         seed: Of the draws.
     """
     count = len(distances)
@@ -57,7 +70,37 @@ def compare(
     tail = (1 - _LEVEL) / 2
     low, high = np.quantile(ratios, [tail, 1 - tail], axis=0)
     ratio = _ratio(distances.mean(axis=0), others.mean(axis=0))
-    return Comparison(name, ratio, low, high)
+    widening = _student(independent)[:, None]
+    is_told = np.isfinite(widening)
+    widening = np.where(is_told, widening, 1.0)
+    size = np.maximum(ratio, 1e-200)
+    low = size * np.minimum(low / size, 1.0) ** widening
+    high = np.minimum(size * np.maximum(high / size, 1.0) ** widening, _LARGEST_RATIO)
+    return Comparison(
+        name, ratio, np.where(is_told, low, 0.0), np.where(is_told, high, np.inf)
+    )
+
+
+def independent_predictions(windows: Windows, steps: Sequence[int]) -> Array:
+    """Counts the predictions (steps,) that do not overlap.
+
+    Args:
+        windows: From whose starts is predicted.
+        steps: After the starts.
+    """
+    rows = len(windows) * windows.stride
+    return rows / np.maximum(steps, windows.stride)
+
+
+def _student(independent: Sequence[float] | Array) -> Array:
+    """Returns by how much the logarithms of intervals (steps,) are to be longer.
+
+    That is infinitely where there are too few predictions.
+    """
+    count = np.asarray(independent, dtype=float)
+    probability = (1 + _LEVEL) / 2
+    quantile = stdtrit(np.maximum(count - 1, 1.0), probability)
+    return np.where(count < FEWEST_PREDICTIONS, np.inf, quantile / ndtri(probability))
 
 
 def _at_most_diverged(distances: Array) -> Array:

@@ -15,9 +15,13 @@ import numpy as np
 from scipy.linalg import LinAlgError, solve_discrete_are
 
 from gpmpc._dynamics import Array
+from gpmpc.exceptions import DataError
 from gpmpc.logs._inspection import FOLLOWS, input_dependence
 from gpmpc.logs._log import Log
 from gpmpc.logs._output_gps import choose_rows
+from gpmpc.logs._ranges import state_widths, widths_of
+from gpmpc.logs._regression import Standardization, fit_affine
+from gpmpc.models._kinematics import RigidBodyKinematics
 from gpmpc.models._log_model import LogModel
 
 _SIGNIFICANT = 3.0  # standard errors by which an effect has to differ from none
@@ -27,6 +31,9 @@ _ROWS = 20_000  # that are looked at, at most
 _STATES = 6  # about which feedbacks are tried
 _DIFFERENCE = 1e-5  # of the ranges of states and inputs
 _UNSTABLE = 1.002  # spectral radius
+_MISSED = 0.1  # of an output's variance: what a model misses of it counts
+_TOLD_BY_PAST = 0.25  # of that, which is left where the rows before tell it
+_ROWS_A_REGRESSOR = 8  # fewer tell nothing
 _DITHER = 0.1  # standard deviation of an excitation over the range of an input
 
 
@@ -80,7 +87,8 @@ def judge_for_control(
     measured = model.kinematics.outputs(states, next_states, log.time_step)
     gains, errors = _gains(model, states, inputs, context, measured)
     slopes = _mean_slopes(model, states, inputs, context)
-    deviation = np.maximum(measured.std(axis=0), 1e-12)
+    deviation = measured.std(axis=0)
+    deviation = np.where(deviation > 0, deviation, np.inf)
     names = log.different_input_names
     significance = _significance(gains, errors)
     effects = _effects(model, names, gains, errors, slopes)
@@ -89,9 +97,10 @@ def judge_for_control(
     moves = np.abs(slopes) * np.ptp(inputs, axis=0) / deviation[:, None]
     if moves.max() < _LEAST_EFFECT:
         faults.append("no output of the model depends on any input")
+    advice = _excitation(log, names, inputs) if faults else ()
+    faults += _hidden_motions(model, log, stride)
     known = [effect for effect in effects if effect.input not in unknown]
     warnings = _disagreements(known) + _unstable_loops(model, log, rivals)
-    advice = _excitation(log, names, inputs) if faults else ()
     return ControlFitness(tuple(effects), tuple(faults), tuple(warnings), advice)
 
 
@@ -156,9 +165,9 @@ def _gains(
     features = model.kinematics.features(states, inputs, context)
     m = inputs.shape[1]
     first = features.shape[1] - context.shape[1] - m
-    deviation = np.maximum(features.std(axis=0), 1e-12)
-    z = (features - features.mean(axis=0)) / deviation
-    z = np.column_stack([z, np.ones(len(z))])
+    scales = Standardization.of(features)
+    deviation = scales.deviation
+    z = np.column_stack([scales(features), np.ones(len(features))])
     inverse = np.linalg.pinv(z.T @ z, rcond=1e-10)
     weights = inverse @ (z.T @ measured)  # (f + 1, o)
     residuals = measured - z @ weights
@@ -180,7 +189,7 @@ def _mean_slopes(
     u = inputs[::every]
     c = context[::every]
     columns = []
-    for h in _DIFFERENCE * np.diag(_widths(inputs)):
+    for h in _DIFFERENCE * np.diag(widths_of(inputs)):
         change = model.outputs(x, u + h, c) - model.outputs(x, u - h, c)
         columns.append(change.mean(axis=0) / (2 * h.sum()))
     return np.stack(columns, axis=-1)
@@ -209,22 +218,60 @@ def _unknown_effects(log: Log, inputs: Array, significance: Array) -> dict[str, 
     return reasons
 
 
+def _hidden_motions(model: LogModel, log: Log, stride: int) -> list[str]:
+    """Says of which states only the rows before tell where they go.
+
+    A position without its velocity carries no momentum: what a model misses of its
+    movement is in the movements of the two rows before. White noise of a sensor is
+    told by the rows before as well, but no more than half of it.
+    """
+    kinematics = model.kinematics
+    if isinstance(kinematics, RigidBodyKinematics):
+        return []  # whose state has all velocities
+    past = max(model.past, 2)
+    try:
+        windows = log.windows(1, past=past, stride=stride)
+    except DataError:
+        return []
+    measured, modelled = model.first_outputs(windows)
+    missed = measured - modelled
+    states = windows.states
+    context = windows.context[:, past]
+    columns = [kinematics.features(states[:, past], windows.inputs[:, past], context)]
+    for row in (past - 2, past - 1):
+        columns.append(
+            kinematics.outputs(states[:, row], states[:, row + 1], log.time_step)
+        )
+    regressors = np.hstack(columns)
+    rows, count = regressors.shape
+    if rows < _ROWS_A_REGRESSOR * count:
+        return []
+    regressors -= regressors.mean(axis=0)
+    weights = fit_affine(regressors, missed)
+    left = (missed - regressors @ weights[:-1]).var(axis=0) * rows / (rows - count)
+    is_hidden = (missed.var(axis=0) > _MISSED * measured.var(axis=0)) & (
+        left < _TOLD_BY_PAST * missed.var(axis=0)
+    )
+    hidden = [kinematics.output_names[i] for i in np.flatnonzero(is_hidden)]
+    if not hidden:
+        return []
+    names = ", ".join(hidden)
+    return [
+        f"the states do not say where they go: the rows before tell {names} better "
+        "than the model. Add the velocity as a state, or a column with the "
+        "difference from the row before"
+    ]
+
+
 def _excitation(log: Log, names: Sequence[str], inputs: Array) -> tuple[str, ...]:
     """Returns what to fly, so that the effects of the inputs can be told."""
-    dither = ", ".join(f"{_DITHER * width:.2g}" for width in _widths(inputs))
+    dither = ", ".join(f"{_DITHER * width:.2g}" for width in widths_of(inputs))
     seconds = max(60.0, 500 * log.time_step)
     return (
         f"fly again for {seconds:.0f} s with noise added to the inputs "
         f"({', '.join(names)}), a tenth of the range that each has in this log: "
         f"gpmpc run ... noise.input=[{dither}] steps={seconds / log.time_step:.0f}",
     )
-
-
-def _widths(values: Array) -> Array:
-    """Returns the ranges (c,) of values (K, c): of still ones their size, or one."""
-    ranges = np.ptp(values, axis=0)
-    sizes = np.abs(values).max(axis=0)
-    return np.where(ranges > 0, ranges, np.where(sizes > 0, sizes, 1.0))
 
 
 def _unstable_loops(
@@ -241,19 +288,25 @@ def _unstable_loops(
     features = model.kinematics.features(states, inputs, windows.context[:, 0])
     rows = choose_rows(features, _STATES)
     context = windows.context[rows, 0]
-    spread = model.kinematics.space.difference(states, states[:1]).std(axis=0)
-    Q = np.diag(1 / np.maximum(spread, 1e-9) ** 2)
-    R = np.diag(1 / np.maximum(inputs.std(axis=0), 1e-9) ** 2)
-    A, B = _linearize(model, states[rows], inputs[rows], context, log.time_step)
+    space = model.kinematics.space
+    spread = space.difference(states, states[:1]).std(axis=0)
+    spread = np.where(spread > 0, spread, state_widths(space, states))
+    input_spread = inputs.std(axis=0)
+    input_spread = np.where(input_spread > 0, input_spread, widths_of(inputs))
+
+    def linearize(model: LogModel) -> tuple[Array, Array]:
+        A, B = _linearize(model, states[rows], inputs[rows], context, log.time_step)
+        scaled_A = A * spread / spread[:, None]
+        return scaled_A, B * input_spread / spread[:, None]
+
+    A, B = linearize(model)
     sentences = []
     for name, rival in rivals.items():
-        rival_A, rival_B = _linearize(
-            rival, states[rows], inputs[rows], context, log.time_step
-        )
+        rival_A, rival_B = linearize(rival)
         tried = 0
         unstable = 0
         for k in range(len(rows)):
-            K = _regulator(A[k], B[k], Q, R)
+            K = _regulator(A[k], B[k])
             if K is None:
                 continue
             tried += 1
@@ -267,10 +320,14 @@ def _unstable_loops(
     return sentences
 
 
-def _regulator(A: Array, B: Array, Q: Array, R: Array) -> Array | None:
-    """Returns the gain of u = -K x; None where there is none that stabilises."""
+def _regulator(A: Array, B: Array) -> Array | None:
+    """Returns the gain of u = -K x, whose weights are ones.
+
+    There is none, None, where none stabilises.
+    """
+    R = np.eye(B.shape[1])
     try:
-        P = solve_discrete_are(A, B, Q, R)
+        P = solve_discrete_are(A, B, np.eye(len(A)), R)
     except (LinAlgError, ValueError):
         return None
     return np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
@@ -284,8 +341,8 @@ def _linearize(
     They are differences over small parts of the ranges that states and inputs have.
     """
     space = model.kinematics.space
-    x_steps = _DIFFERENCE * _widths(space.difference(states, states[:1]))
-    u_steps = _DIFFERENCE * _widths(inputs)
+    x_steps = _DIFFERENCE * widths_of(space.difference(states, states[:1]))
+    u_steps = _DIFFERENCE * widths_of(inputs)
 
     def predict(x: Array, u: Array) -> Array:
         return model.kinematics.step(x, model.outputs(x, u, context), time_step)

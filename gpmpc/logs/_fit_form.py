@@ -2,18 +2,24 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from gpmpc._dynamics import Array
-from gpmpc.logs._fitting import PAST, NominalFit, fit_nominal
+from gpmpc.logs._fitting import (
+    PAST,
+    NominalFit,
+    distances_at_rest,
+    fit_nominal,
+    mean_logarithm,
+)
 from gpmpc.logs._linear_terms import (
     fit_linear_term,
     refine_linear_term,
     regression_data,
 )
 from gpmpc.logs._log import Log
+from gpmpc.logs._regression import fit_affine
 from gpmpc.models._kinematics import RigidBodyKinematics
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._memory import NO_MEMORY
@@ -143,6 +149,7 @@ class _LagTrials:
         past = max(model.past, PAST)
         self._windows = log.windows(steps, past=past, most=_WINDOWS)
         self._steps = sorted({min(step, steps) for step in _JUDGED})
+        self._at_rest = distances_at_rest(self._windows, self._steps)
 
     def fit(self, time_constants: Array) -> LogModel:
         """Fits the affine part of the model with time constants (m,)."""
@@ -154,7 +161,7 @@ class _LagTrials:
         fitted = self.fit(time_constants)
         errors = fitted.rollout_errors(self._windows, self._steps)
         distances = self._windows.space.distances(errors).mean(axis=0)
-        return float(np.log(np.maximum(distances, 1e-12)).mean())
+        return float(mean_logarithm(distances, self._at_rest))
 
 
 def _fit_affine_part(model: LogModel, log: Log) -> LogModel:
@@ -167,5 +174,5 @@ def _fit_affine_part(model: LogModel, log: Log) -> LogModel:
         history=(0,) * len(model.history),
     )
     regressors, outputs = regression_data(still, windows)
-    solution: Any = np.linalg.lstsq(regressors, outputs, rcond=1e-8)[0]
-    return replace(model, theta=solution.T.ravel())
+    features = regressors[:, :-1]  # the last one is the constant
+    return replace(model, theta=fit_affine(features, outputs).T.ravel())

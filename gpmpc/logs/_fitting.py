@@ -7,8 +7,8 @@ that does not move (multiple-step prediction error; Ljung, 1999, section 3.3), w
 loss that is linear for outliers.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -23,6 +23,8 @@ from gpmpc.exceptions import (
     check_number,
 )
 from gpmpc.logs._log import Log
+from gpmpc.logs._ranges import state_widths
+from gpmpc.logs._regression import fit_affine
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._parametric import AffineNominal
@@ -34,9 +36,11 @@ _WINDOWS = 300
 _EVALUATIONS = 15
 _COUNTED_STEPS = 8  # steps of a rollout whose errors count
 _BATCH = 40_000  # states of one batch of rollouts: parameter vectors times windows
-_BLOCK = 4  # consecutive windows whose errors are correlated
+_FEWEST_BLOCKS = 8  # of consecutive windows, whose errors are correlated
 _FIRST_TIME_CONSTANT = 0.03  # [s] of a first-order lag, at which the search begins,
 _FIRST_STEPS = (1.0, 30.0)  # or this many time steps at least and at most
+_ROUNDING = 1e-12  # of a state's range: least error of one that does not move
+_EXACT = 1e-9  # of an error at rest: what is smaller counts as exact
 _DIVERGED = 1e6  # residual of a rollout that is not finite
 
 
@@ -100,7 +104,8 @@ def fit_nominal(
         raise SettingError("theta0", f"{rule}; got {theta0[:count].tolist()}")
     if not len(theta0):
         return NominalFit(replace(model, theta=theta0), standard_errors=theta0)
-    residuals = _RolloutResiduals(model, windows, steps, bounds)
+    sizes = np.where(theta0 != 0, np.abs(theta0), 1.0)
+    residuals = _RolloutResiduals(model, windows, steps, bounds, sizes)
     theta = _minimize(residuals, theta0)
     if lags and theta[count:].min() <= 0 and theta0[-1] > log.time_step:
         # The search jumped below zero, where nothing pulls a lag back.
@@ -108,7 +113,9 @@ def fit_nominal(
         theta = min(theta, _minimize(residuals, from_a_step), key=residuals.loss)
     time_constants = np.maximum(theta[count:], 0.0)
     standard_errors = _standard_errors(
-        J=residuals.jacobian(theta), residuals=residuals.of_windows(theta[None])[0]
+        J=residuals.jacobian(theta),
+        residuals=residuals.of_windows(theta[None])[0],
+        block=2 * -(-steps // windows.stride),
     )
     fitted = replace(model, theta=theta[:count], time_constants=time_constants)
     return NominalFit(fitted, standard_errors[:count])
@@ -168,6 +175,7 @@ class _RolloutResiduals:
         windows: W of them.
         steps: Of the rollouts.
         bounds: Smallest and largest parameters (P,), (P,).
+        sizes: That parameters are supposed to have (P,).
     """
 
     def __init__(
@@ -176,8 +184,10 @@ class _RolloutResiduals:
         windows: Windows,
         steps: int,
         bounds: tuple[Array, Array],
+        sizes: Array,
     ):
         self.bounds = bounds
+        self._sizes = sizes
         self._model = model
         self._windows = windows
         self._steps = steps
@@ -214,7 +224,7 @@ class _RolloutResiduals:
         By differences of one batch, forward, or backward at an upper bound: a system
         may refuse what lies beyond it.
         """
-        h = 1e-5 * np.maximum(np.abs(theta), 1.0)
+        h = 1e-5 * np.maximum(np.abs(theta), self._sizes)
         low, high = self.bounds
         above = high - theta
         below = theta - low
@@ -232,15 +242,34 @@ def errors_at_rest(windows: Windows, steps: np.ndarray) -> Array:
 
     They are the same for all entries of a group, and never zero.
     """
+    entries = [group.error_dim for group in windows.space.groups]
+    return np.repeat(distances_at_rest(windows, steps), entries, axis=1)
+
+
+def distances_at_rest(windows: Windows, steps: Sequence[int] | np.ndarray) -> Array:
+    """Computes the mean errors (steps, groups) of a state that does not move.
+
+    They are never zero.
+    """
+    space = windows.space
     start = windows.states[:, windows.past : windows.past + 1]
     errors = windows.errors(np.repeat(start, windows.ahead, axis=1), steps)
-    mean = windows.space.distances(errors).mean(axis=0)
-    positive = np.maximum(mean, 1e-3 * mean.max(axis=0) + 1e-12)
-    entries = [group.error_dim for group in windows.space.groups]
-    return np.repeat(positive, entries, axis=1)
+    mean = space.distances(errors).mean(axis=0)
+    sizes = space.distances(state_widths(space, start[:, 0]))
+    return np.maximum(mean, 1e-3 * mean.max(axis=0) + _ROUNDING * sizes)
 
 
-def _standard_errors(J: Array, residuals: Array) -> Array:
+def mean_logarithm(errors: Array, at_rest: Array) -> Array:
+    """Computes the mean logarithm (...) of rollouts' errors over those at rest.
+
+    Args:
+        errors: Mean distances (..., steps, groups).
+        at_rest: From ``distances_at_rest`` (steps, groups).
+    """
+    return np.log(np.maximum(errors / at_rest, _EXACT)).mean(axis=(-2, -1))
+
+
+def _standard_errors(J: Array, residuals: Array, block: int) -> Array:
     """Computes standard errors of parameters (P,) by a sandwich estimate.
 
     Residuals may be correlated within blocks of windows.
@@ -248,12 +277,14 @@ def _standard_errors(J: Array, residuals: Array) -> Array:
     Args:
         J: Derivatives of the residuals (R, P).
         residuals: Of W windows (W, ...), R in all.
+        block: Windows that are correlated; fewer count where there are few blocks.
     """
     values = residuals.ravel()
     weights = 1 / np.sqrt(1 + values**2)  # of the loss
     gradients = J * (weights * values)[:, None]
     scores = gradients.reshape(len(residuals), -1, J.shape[1]).sum(axis=1)
-    blocks = np.add.reduceat(scores, np.arange(0, len(scores), _BLOCK))
+    block = max(min(block, len(scores) // _FEWEST_BLOCKS), 1)
+    blocks = np.add.reduceat(scores, np.arange(0, len(scores), block))
     bread = np.linalg.pinv(J.T @ (J * weights[:, None]))
     covariance = bread @ (blocks.T @ blocks) @ bread
     return np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
@@ -266,11 +297,9 @@ def fit_least_squares(kinematics: Kinematics, log: Log) -> LogModel:
     next_states = windows.states[:, 1]
     features = kinematics.features(states, windows.inputs[:, 0], windows.context[:, 0])
     outputs = kinematics.outputs(states, next_states, log.time_step)
-    regressors = np.column_stack([features, np.ones(len(features))])
-    solution: Any = np.linalg.lstsq(regressors, outputs, rcond=1e-8)[0]
     return LogModel(
         kinematics=kinematics,
         nominal=AffineNominal(kinematics),
-        theta=solution.T.ravel(),
+        theta=fit_affine(features, outputs).T.ravel(),
         history=(0,) * outputs.shape[1],
     )

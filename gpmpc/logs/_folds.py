@@ -80,9 +80,8 @@ def split_folds(log: Log, past: int, steps: int, most: int = _FOLDS_OF_SHORT) ->
         folds = _split(log, most, past, steps)
         if folds is not None:
             return folds
-    folds = _split(log, 2, past, steps)
-    if folds is None:
-        return _halves(log, past)
+    folds = _split(log, 2, past, steps) or _halves(log, past)
+    _check_windows(folds, past, steps)
     return folds
 
 
@@ -280,12 +279,17 @@ def _is_usable(folds: Folds, past: int, steps: int) -> bool:
     if min(rows) < _BALANCED * np.mean(rows):
         return False
     try:
-        for fold in folds.parts:
-            fold.train.windows(steps, past, most=1)
-            fold.held_out.windows(steps, past, most=1)
+        _check_windows(folds, past, steps)
     except DataError:
         return False
     return True
+
+
+def _check_windows(folds: Folds, past: int, steps: int) -> None:
+    """Raises ``DataError`` unless both sides of all folds have windows."""
+    for fold in folds.parts:
+        fold.train.windows(steps, past, most=1)
+        fold.held_out.windows(steps, past, most=1)
 
 
 def _coverage(fold: Fold) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 
 from gpmpc._dynamics import Array
 from gpmpc.logs._folds import Fold
+from gpmpc.logs._ranges import state_widths
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._windows import Windows
 
@@ -57,7 +58,9 @@ class FreeSimulation:
         rows = np.concatenate([run.states for fold in folds for run in fold.held_out])
         deviations = space.distances((rows - rows.mean(axis=0))[:, None])[:, 0]
         spread = np.sqrt(np.square(deviations).mean(axis=0))
-        return cls(windows, np.maximum(spread, 1e-12))
+        # Of a state that never moves, its size.
+        sizes = space.distances(state_widths(space, rows))
+        return cls(windows, np.where(spread > 0, spread, sizes))
 
     @property
     def worst_logarithms(self) -> Array:

@@ -6,15 +6,21 @@ import numpy as np
 
 from gpmpc._dynamics import Array
 from gpmpc.logs._baselines import CONSTANT_STATE, baseline_errors
-from gpmpc.logs._comparison import Comparison, compare
+from gpmpc.logs._comparison import (
+    Comparison,
+    compare,
+    independent_predictions,
+)
 from gpmpc.logs._folds import Fold
 from gpmpc.logs._log import Log
+from gpmpc.logs._ranges import state_widths
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._log_model import LogModel
 
 _JUDGED = (1, 10, 50)  # steps whose errors decide
 _WINDOWS = 400  # that structures are compared on
 _EXACT = 1e-4  # of a constant state's error: what is smaller counts as exact
+_ROUNDING = 1e-12  # of a state's range: likewise, where a constant state is exact
 
 
 class HeldOutErrors:
@@ -48,7 +54,9 @@ class HeldOutErrors:
         ]
         self._baselines = self._baseline_distances(kinematics)
         still = self._baselines[CONSTANT_STATE].mean(axis=0)
-        self._exact = _EXACT * still + 1e-12
+        states = np.concatenate([run.states for run in log])
+        sizes = log.space.distances(state_widths(log.space, states))
+        self._exact = _EXACT * still + _ROUNDING * sizes
         self._scale = self._best_baseline_errors()
 
     def mean(self, models: Sequence[LogModel]) -> Array:
@@ -87,8 +95,19 @@ class HeldOutErrors:
                 name = f"{name}, fitted on rollouts"
             others[name] = self._distances(rival)
         block = 2 * -(-self._steps // min(w.stride for w in self.windows))
+        independent = np.sum(
+            [independent_predictions(w, self.judged_steps) for w in self.windows],
+            axis=0,
+        )
         return tuple(
-            compare(name, distances, other, block=block, seed=seed)
+            compare(
+                name=name,
+                distances=distances,
+                others=other,
+                block=block,
+                independent=independent,
+                seed=seed,
+            )
             for name, other in others.items()
         )
 

@@ -37,6 +37,7 @@ from gpmpc.logs._formats import read_file
 from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._read_log import read_log
+from gpmpc.logs._regression import Standardization, fit_affine
 from gpmpc.logs._row_times import read_dates, row_times, unit_in_name
 from gpmpc.logs._runs import split_into_runs
 from gpmpc.logs._signals import holds_times, read_column
@@ -528,10 +529,10 @@ def input_dependence(log: Log) -> dict[str, float]:
     """
     states = np.concatenate([run.states for run in log])
     inputs = np.concatenate([run.inputs for run in log])
-    scaled = (states - states.mean(axis=0)) / np.maximum(states.std(axis=0), 1e-12)
-    features = np.column_stack([np.ones(len(scaled)), scaled, scaled**2])
-    weights = np.linalg.lstsq(features, inputs, rcond=1e-8)[0]
-    unexplained = (inputs - features @ weights).var(axis=0)
+    scaled = Standardization.of(states)(states)
+    features = np.column_stack([scaled, scaled**2])
+    weights = fit_affine(features, inputs)
+    unexplained = (inputs - features @ weights[:-1]).var(axis=0)
     return _explained_shares(log.different_input_names, unexplained, inputs.var(axis=0))
 
 

@@ -20,9 +20,14 @@ from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError, SettingError, check_kind, check_number
 from gpmpc.logs._baselines import CONSTANT_STATE, baseline_errors
-from gpmpc.logs._comparison import Comparison, compare
+from gpmpc.logs._comparison import (
+    FEWEST_PREDICTIONS,
+    Comparison,
+    compare,
+    independent_predictions,
+)
 from gpmpc.logs._fitting import PAST
-from gpmpc.logs._learning import IdentifiedModel
+from gpmpc.logs._learning import IdentifiedModel, fewest_rows
 from gpmpc.logs._log import Log
 from gpmpc.logs._noise import error_variances, follow_errors
 from gpmpc.metrics import binomial_interval
@@ -71,6 +76,18 @@ class Judgement:
         They are by more than 2 %, and by more than chance.
         """
         return self.losses_to([comparison.name for comparison in self.comparisons])
+
+    @property
+    def steps_not_told(self) -> tuple[int, ...]:
+        """The steps ahead at which too few rows tell a loss from chance.
+
+        Of them fewer than four predictions do not overlap.
+        """
+        return tuple(
+            step
+            for k, step in enumerate(self.steps)
+            if any(np.isinf(one.high[k]).any() for one in self.comparisons)
+        )
 
     def losses_to(self, baselines: Sequence[str]) -> tuple[str, ...]:
         """Returns sentences on the errors that are larger than those of some baselines.
@@ -166,25 +183,23 @@ def judge(
         coverage_interval=_coverage_intervals(coverage, windows, steps),
         width=np.sqrt(claimed / np.maximum(actual, 1e-300)),
         windows=len(windows),
-        comparisons=_comparisons(distances, windows),
+        comparisons=_comparisons(distances, windows, steps),
     )
 
 
-def check_held_out(held_out: Log, steps: int) -> None:
+def check_held_out(held_out: Log) -> None:
     """Raises ``DataError`` of a log on which no model can be judged.
 
     Args:
-        held_out: Runs that are to be held out.
-        steps: The most of the steps ahead.
+        held_out: Runs that are to be held out, with the past of the first rows.
     """
-    needed = PAST + steps + 1
+    needed = PAST + 2
     longest = held_out.longest_piece
     if longest < needed:
         names = ", ".join(run.name for run in held_out)
         raise DataError(
-            f"{names}: judging {steps} steps ahead needs {needed} rows without a gap; "
-            f"the longest piece that is held out has {longest}: hold out longer runs, "
-            "or ask for fewer steps"
+            f"{names}: judging a model needs {needed} rows without a gap; the longest "
+            f"piece that is held out has {longest}: hold out longer runs"
         )
 
 
@@ -194,13 +209,15 @@ def check_train(train: Log) -> None:
     Args:
         train: Runs that are to be learned from.
     """
-    needed = PAST + 2
+    needed = fewest_rows(len(train.runs))
     longest = train.longest_piece
     if longest < needed:
+        remedies = ["log longer runs", "resample over gaps (rate and max_gap)"]
+        if any(finding.kind == "at rest" for finding in train.findings):
+            remedies.append("keep what is at rest (rest: use)")
         raise DataError(
             f"learning needs {needed} rows without a gap; the longest piece to learn "
-            f"from has {longest}: log longer runs, or resample over gaps (rate and "
-            "max_gap)"
+            f"from has {longest}: {', or '.join(remedies)}"
         )
 
 
@@ -215,6 +232,24 @@ def most_steps(learned: IdentifiedModel, held_out: Log, train: Log) -> int:
     judged = held_out.longest_piece - past - 1
     fitted = train.longest_piece - PAST - 1
     return min(judged, fitted)
+
+
+def most_told_steps(learned: IdentifiedModel, held_out: Log) -> int:
+    """Returns how many steps ahead held-out rows tell a loss from chance.
+
+    So many that four predictions do not overlap; less than one for none.
+    """
+    past = max(learned.model.past, PAST)
+    rows = [b - a - past for run in held_out for a, b in run.pieces]
+    steps = 0
+    while _starts(rows, steps + 1) >= FEWEST_PREDICTIONS * (steps + 1):
+        steps += 1
+    return steps
+
+
+def _starts(rows: Sequence[int], steps: int) -> int:
+    """Counts the starts of predictions in pieces of so many rows behind the past."""
+    return sum(max(length - steps, 0) for length in rows)
 
 
 def check_learned(learned: IdentifiedModel, held_out: Log, train: Log) -> None:
@@ -287,7 +322,7 @@ def _check_steps(steps: Sequence[int]) -> None:
 
 
 def _comparisons(
-    distances: Mapping[str, Array], windows: Windows
+    distances: Mapping[str, Array], windows: Windows, steps: Sequence[int]
 ) -> tuple[Comparison, ...]:
     """Compares the errors of the model with those of each baseline.
 
@@ -301,6 +336,7 @@ def _comparisons(
             distances=distances[MODEL] + rounding,
             others=others + rounding,
             block=block,
+            independent=independent_predictions(windows, steps),
             seed=0,
         )
         for name, others in distances.items()
@@ -341,9 +377,8 @@ def _coverage_intervals(
     Only predictions that do not overlap are counted: they are independent.
     """
     intervals = []
-    for frequencies, step in zip(coverage, steps, strict=True):
-        rows = len(windows) * windows.stride
-        count = max(rows // max(step, windows.stride), 1)
+    counts = np.maximum(independent_predictions(windows, steps).astype(int), 1)
+    for frequencies, count in zip(coverage, counts.tolist(), strict=True):
         intervals.append(
             [binomial_interval(round(f * count), count, LEVEL) for f in frequencies]
         )

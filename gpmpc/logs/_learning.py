@@ -11,18 +11,18 @@ noise comes from those rollouts as well.
 import hashlib
 from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
-from gpmpc.exceptions import SettingError, check_kind, check_number
+from gpmpc.exceptions import DataError, SettingError, check_kind, check_number
 from gpmpc.gp._wrapped import warn_of_turns
 from gpmpc.logs._comparison import Comparison
 from gpmpc.logs._control_fitness import ControlFitness, judge_for_control
 from gpmpc.logs._fitting import STEPS, NominalFit
-from gpmpc.logs._folds import MANY_RUNS, split_folds
+from gpmpc.logs._folds import MANY_RUNS, Folds, split_folds
 from gpmpc.logs._log import Log
 from gpmpc.logs._ranges import ranges_of
 from gpmpc.logs._search import Search
@@ -31,6 +31,7 @@ from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._namings import NO_NAMINGS, Namings
 
+_FEWEST_STEPS = 2  # of the rollouts that decide
 _ARGUMENTS = "arguments"  # key of a memory: what it holds results of
 
 
@@ -78,8 +79,8 @@ def learn(
     """Learns a model of the outputs behind a log.
 
     Args:
-        log: Of one run at least. Four runs or more are dealt to folds, the blocks of
-            fewer take turns.
+        log: Of one run at least. Four runs or more are dealt to folds; the blocks of
+            fewer, or of runs that are too unlike each other, take turns.
         points: Rows that a GP is trained on, chosen by k-means.
         steps: Of the rollouts; fewer where the log is too short to be halved for them.
         seed: Of every random number but those that deal runs to folds, which are the
@@ -114,30 +115,24 @@ def learn(
     _check_memory(memory, log, (points, steps, seed, for_control))
     advice = "Say kind: angle of it in the mapping"
     warn_of_turns(log.transitions(), log.space.angles, advice)
-    reach = most_reach(log, for_control)
-    late = rows_late(log, reach)
-    past = past_rows(reach, late)
-    affordable = _most_steps(log, past)
-    if affordable < steps:
-        progress(f"short log: rollouts of {affordable} steps decide, not of {steps}")
-        steps = affordable
-    has_few_parameters = for_control or log.mapping.model != "none"
-    folds = split_folds(log, past, steps, most=2 if has_few_parameters else 4)
-    progress(folds.sentence)
+    plan = _plan_folds(log, steps, for_control)
+    if plan.steps < steps:
+        progress(f"short log: rollouts of {plan.steps} steps decide, not of {steps}")
+    progress(plan.folds.sentence)
     search = Search(
         log=log,
-        folds=folds.parts,
-        reach=reach,
-        late=late,
+        folds=plan.folds.parts,
+        reach=plan.reach,
+        late=plan.late,
         points=points,
-        steps=steps,
+        steps=plan.steps,
         seed=seed,
         progress=progress,
         memory=memory,
         for_control=for_control,
     )
     search.run()
-    return _identify(search, log, folds.sentence, progress, for_control)
+    return _identify(search, log, plan.folds.sentence, progress, for_control)
 
 
 def _check_memory(
@@ -162,12 +157,64 @@ def _check_memory(
         )
 
 
+def fewest_rows(runs: int) -> int:
+    """Returns the rows without a gap that learning needs at least, of so many runs.
+
+    They are those of windows of two steps; a run is halved where there are few.
+    """
+    window = past_rows(0) + _FEWEST_STEPS + 1
+    return window if runs >= MANY_RUNS else 2 * window
+
+
+class _Plan(NamedTuple):
+    """How a log is split to compare structures, and what these may be."""
+
+    folds: Folds
+    reach: int  # most rows that a structure may look back on
+    late: int  # rows by which inputs are likely to act late
+    steps: int  # of the rollouts
+
+
+def _plan_folds(log: Log, steps: int, for_control: bool) -> _Plan:
+    """Splits a log for rollouts of so many steps, or of fewer where it is short.
+
+    Where not even two steps are possible, structures look back on fewer rows.
+
+    Raises:
+        DataError: No piece of the log is long enough.
+    """
+    reach = most_reach(log, for_control)
+    has_few_parameters = for_control or log.mapping.model != "none"
+    most_folds = 2 if has_few_parameters else 4
+    while True:
+        late = rows_late(log, reach)
+        past = past_rows(reach, late)
+        fewer = min(steps, _most_steps(log, past))
+        while fewer >= _FEWEST_STEPS:
+            try:
+                folds = split_folds(log, past, fewer, most=most_folds)
+                return _Plan(folds, reach, late, fewer)
+            except DataError:
+                fewer -= max(fewer // 8, 1)
+        if reach == 0:
+            runs = len(log.runs)
+            raise DataError(
+                f"learning needs {fewest_rows(runs)} rows without a gap in "
+                f"{'two runs' if runs >= MANY_RUNS else 'a run'}; the longest piece "
+                f"has {log.longest_piece}"
+            )
+        reach = 0
+
+
 def _most_steps(log: Log, past: int) -> int:
-    """Returns the most steps, two at least, of which any fold of a log has windows."""
-    longest = max(end - begin for run in log for begin, end in run.pieces)
+    """Returns the most steps of which a fold of a log may have windows.
+
+    A window has the past, the start and the steps.
+    """
+    longest = log.longest_piece
     if len(log.runs) < MANY_RUNS:
         longest //= 2  # runs are halved where nothing else is possible
-    return max(longest - past - 2, 2)
+    return longest - past - 1
 
 
 def _identify(

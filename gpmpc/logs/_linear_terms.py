@@ -22,8 +22,13 @@ from scipy.optimize import least_squares
 
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
-from gpmpc.logs._fitting import errors_at_rest
+from gpmpc.logs._fitting import (
+    distances_at_rest,
+    errors_at_rest,
+    mean_logarithm,
+)
 from gpmpc.logs._log import Log, LogRun
+from gpmpc.logs._regression import Standardization
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._windows import Windows
 
@@ -139,9 +144,8 @@ class _RolloutErrors:
         counted = np.geomspace(1, steps, _COUNTED_STEPS).round().astype(int)
         counted = np.unique(counted)
         deviation = _moments(model, log).deviation
-        deviation = np.where(np.isfinite(deviation), deviation, np.inf)
         moved = np.where(np.isfinite(deviation), model.weights * deviation, 0.0)
-        size = np.linalg.norm(moved, axis=1, keepdims=True) + 1e-12
+        size = np.linalg.norm(moved, axis=1, keepdims=True)
         return cls(
             model=model,
             windows=windows,
@@ -217,6 +221,7 @@ class _Trial:
     moments: Moments  # of the one half
     windows: Windows  # of the other one
     steps: tuple[int, ...]
+    at_rest: Array  # errors of a constant state (steps, groups)
 
     @classmethod
     def of(cls, model: LogModel, log: Log, held_out: Log, steps: int) -> "_Trial":
@@ -227,7 +232,8 @@ class _Trial:
         steps = max(min(steps, held_out.longest_piece - model.past - 1), 1)
         windows = held_out.windows(steps, past=model.past, most=_WINDOWS)
         judged = tuple(sorted({min(step, steps) for step in _JUDGED}))
-        return cls(model, _moments(model, log), windows, judged)
+        at_rest = distances_at_rest(windows, judged)
+        return cls(model, _moments(model, log), windows, judged, at_rest)
 
     def costs(self, candidates: Sequence[Array]) -> Array:
         """Computes the mean logarithm of errors, for penalties beside each other (C,).
@@ -238,7 +244,7 @@ class _Trial:
         model = replace(self.model, weights=weights)
         errors = model.rollout_errors(self.windows, self.steps)
         distances = self.windows.space.distances(errors).mean(axis=1)
-        return np.log(np.maximum(distances, 1e-12)).mean(axis=(1, 2))
+        return mean_logarithm(distances, self.at_rest)
 
 
 def _moments(model: LogModel, log: Log) -> Moments:
@@ -254,15 +260,14 @@ def _moments(model: LogModel, log: Log) -> Moments:
         raise DataError(f"no piece of the log has more than {model.past + 1} rows")
     regressors = np.concatenate([one for one, _ in rows])
     residuals = np.concatenate([other for _, other in rows])
-    mean = regressors.mean(axis=0)
-    deviation = regressors.std(axis=0)
     # What never changes has no effect that could be known.
-    deviation[deviation < 1e-9 * np.maximum(np.abs(mean), 1e-9)] = np.inf
-    mean[-1] = 0.0
-    deviation[-1] = 1.0
-    z = (regressors - mean) / deviation
+    others = Standardization.of(regressors[:, :-1])
+    with_constant = Standardization(
+        mean=np.r_[others.mean, 0.0], deviation=np.r_[others.deviation, 1.0]
+    )
+    z = with_constant(regressors)
     count = len(z)
-    return Moments(mean, deviation, z.T @ z / count, z.T @ residuals / count)
+    return Moments(*with_constant, z.T @ z / count, z.T @ residuals / count)
 
 
 def _as_window(log: Log, run: LogRun, begin: int, end: int) -> Windows:

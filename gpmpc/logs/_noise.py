@@ -14,11 +14,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear, nnls
 
 from gpmpc._dynamics import Array
 from gpmpc.logs._fitting import PAST
 from gpmpc.logs._log import Log
+from gpmpc.logs._ranges import difference_steps, widths_of
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._log_dynamics import TIME_CONSTANTS, OutputNoise
 from gpmpc.models._log_model import LogModel
@@ -30,7 +31,7 @@ _COMPARED = 250  # of a log, on which models of more and of fewer rows are compa
 _LINEARIZED = 400  # of all folds, along which rollouts are linearised: these are slow
 _LINEARIZED_WITH_MEMORY = 120  # likewise of models with many entries to carry on
 _STRIDE_WITH_MEMORY = 8  # of the windows that are linearised of these
-_DIFFERENCE = 1e-6
+_DIFFERENCE_OF_OUTPUTS = 1e-4  # of their ranges: in them a step is linear
 _MOST = 9.0  # of the mean squared error: variance that is claimed at most
 _LEAST_FREEDOM = 4.0  # independent errors that a variance is supposed to be of
 _CUTS = 8  # rounds in which what is cut off is made up for
@@ -147,11 +148,12 @@ def fit_noise(
     residuals = np.concatenate([fold.squared_residuals for fold in folds]).mean(axis=0)
     relative = responses / np.maximum(squared, 1e-300)[..., None]
     relative = relative.reshape(-1, responses.shape[-1])
-    factor = np.maximum(relative.max(axis=0), 1e-300)
+    finite = np.where(np.isfinite(relative), relative, 0.0)
+    factor = np.maximum(finite.max(axis=0), _NOTHING)
     sharing = _sharing_rows(models[0], factor, residuals)
     regressors = np.vstack([relative / factor, sharing])
     targets = np.r_[np.ones(len(relative)), np.zeros(len(sharing))]
-    variances = nnls(regressors, targets)[0] / factor
+    variances = _nonnegative_solution(regressors, targets) / factor
     output_sources = len(TIME_CONSTANTS) * len(residuals)
     rows = sum(len(log) for log in logs)
     largest = np.maximum(_MOST * squared, _NOTHING)
@@ -163,6 +165,20 @@ def fit_noise(
         scales=_scales(kinematics, squared, by_window @ variances, largest),
         largest=largest,
     ).scaled(_student(rows, steps)[:, None])
+
+
+def _nonnegative_solution(regressors: Array, targets: Array) -> Array:
+    """Solves a least squares (R, v) of numbers that are not negative (v,).
+
+    Rows of rollouts whose linearisation is not finite do not count.
+    """
+    is_finite = np.isfinite(regressors).all(axis=1)
+    regressors = regressors[is_finite]
+    targets = targets[is_finite]
+    try:
+        return nnls(regressors, targets)[0]
+    except RuntimeError:  # too many iterations
+        return np.maximum(lsq_linear(regressors, targets, (0, np.inf)).x, 0.0)
 
 
 def _student(rows: int, steps: Sequence[int]) -> Array:
@@ -317,13 +333,16 @@ def _responses(
     disturbance = model.disturbance(windows)
     carried = model.rollout_carried(windows, max(steps))
     E = carried.shape[-1] - windows.space.dim + e
+    difference_lengths = _difference_steps(model, windows, carried[:, 0])
     by_start = np.zeros((W, len(steps), e, E))
     # tails[t] = sum over j > k of rho^(j - k) G_j
     tails = np.zeros((len(time_constants), W, len(steps), e, o))
     sums = np.zeros_like(tails)
     rhos = [np.exp(-1 / max(constant, 1e-9)) for constant in time_constants]
     for k in range(max(steps) - 1, -1, -1):
-        A, B = _linearized_step(model, windows, k, carried[:, k], disturbance)
+        A, B = _linearized_step(
+            model, windows, k, carried[:, k], disturbance, difference_lengths
+        )
         for s, step in enumerate(steps):
             if step == k + 1:
                 by_start[:, s] = np.eye(e, E)
@@ -341,8 +360,44 @@ def _responses(
     return responses
 
 
+class _DifferenceSteps(NamedTuple):
+    """By how much a step is displaced to differentiate it."""
+
+    carried: Array  # errors of states, and what is carried on (E,)
+    outputs: Array  # (o,)
+
+
+def _difference_steps(
+    model: LogModel, windows: Windows, carried: Array
+) -> _DifferenceSteps:
+    """Returns small shares of the ranges that windows have.
+
+    Args:
+        model: Whose steps are linearised.
+        windows: W of them.
+        carried: States at their starts with all that is carried on (W, n + ...).
+    """
+    space = windows.space
+    n = space.dim
+    past = windows.past
+    states = windows.states
+    errors = space.difference(carried[:, :n], space.origin)
+    outputs = model.kinematics.outputs(
+        states[:, past], states[:, past + 1], windows.time_step
+    )
+    return _DifferenceSteps(
+        carried=difference_steps(np.hstack([errors, carried[:, n:]])),
+        outputs=_DIFFERENCE_OF_OUTPUTS * widths_of(outputs),
+    )
+
+
 def _linearized_step(
-    model: LogModel, windows: Windows, k: int, carried: Array, disturbance: Array
+    model: LogModel,
+    windows: Windows,
+    k: int,
+    carried: Array,
+    disturbance: Array,
+    steps: _DifferenceSteps,
 ) -> tuple[Array, Array]:
     """Linearises a step of rollouts by forward differences.
 
@@ -352,6 +407,7 @@ def _linearized_step(
         k: Number of the step.
         carried: States with all that is carried on, before it (W, n + ...).
         disturbance: Of the outputs (W, o).
+        steps: Of the differences.
 
     Returns:
         Derivatives by the state and what is carried on (W, E, E), and by the outputs
@@ -362,9 +418,10 @@ def _linearized_step(
     e = space.error_dim
     E = carried.shape[-1] - n + e
     o = disturbance.shape[-1]
-    by_state = _DIFFERENCE * np.eye(E + o, E)[:, None]
+    by_state = np.zeros((E + o, 1, E))
+    by_state[:E, 0] = np.diag(steps.carried)
     by_output = np.zeros((E + o, 1, o))
-    by_output[E:, 0] = _DIFFERENCE * np.eye(o)
+    by_output[E:, 0] = np.diag(steps.outputs)
     displaced = np.concatenate(
         [
             space.displace(carried[:, :n], by_state[..., :e]),
@@ -391,5 +448,6 @@ def _linearized_step(
         ],
         axis=-1,
     )
-    J = np.moveaxis(changes / _DIFFERENCE, 0, -1)
+    lengths = np.concatenate([steps.carried, steps.outputs])
+    J = np.moveaxis(changes / lengths[:, None, None], 0, -1)
     return J[..., :E], J[..., E:]

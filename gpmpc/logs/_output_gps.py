@@ -12,9 +12,11 @@ from gpmpc.exceptions import DataError
 from gpmpc.gp import Trainer, standardize
 from gpmpc.gp._data_checks import ColumnDescriptions
 from gpmpc.logs._log import Log
+from gpmpc.logs._regression import Standardization
 from gpmpc.models._log_model import LogModel, OutputGP
 from gpmpc.models._windows import Windows
 
+_WINDOWS = 50_000  # among which rows are chosen, at most
 _TOLERANCE = 1e-4  # of the training; rollouts tell no smaller one apart
 
 
@@ -52,7 +54,11 @@ def train_output_gp(
         outputs=[model.kinematics.output_names[output] for output in outputs],
     )
     trainer = Trainer(
-        predicts="value", scaling=standardize, restarts=1, tolerance=_TOLERANCE
+        predicts="value",
+        scaling=standardize,
+        restarts=1,
+        tolerance=_TOLERANCE,
+        resolution=0.0,  # units are those of the log: there is only round-off
     )
     training = trainer.fit(
         torch.from_numpy(features[chosen]),
@@ -72,7 +78,7 @@ def _mean_residuals(
 
     It sees the features of the row in the middle, or the regressors of its memory.
     """
-    windows = log.windows(rows, past=model.past)
+    windows = log.windows(rows, past=model.past, most=_WINDOWS)
     start = windows.past
     window_rows = slice(start, start + rows)
     states = windows.states[:, window_rows]
@@ -123,8 +129,7 @@ def choose_rows(features: Array, count: int, seed: int = 0) -> np.ndarray:
         raise DataError("no row to choose from")
     if len(features) <= count:
         return np.arange(len(features))
-    deviations = np.maximum(features.std(axis=0), 1e-12)
-    z = (features - features.mean(axis=0)) / deviations
+    z = Standardization.of(features)(features)
     sample = z[np.random.default_rng(seed).permutation(len(z))[: 10 * count]]
     farthest = _farthest_points(sample, count)
     with warnings.catch_warnings():

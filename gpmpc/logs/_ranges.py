@@ -11,6 +11,12 @@ import numpy as np
 from gpmpc._angles import arc, whole_turns
 from gpmpc._dynamics import Array
 from gpmpc.logs._log import Log
+from gpmpc.models._state_space import StateSpace
+
+_ROUNDING = 1e-12  # of a value
+_STEP = 1e-6  # of a width
+_STEP_OF_SIZE = 1e-8  # of the largest value: less is lost in its rounding
+_LARGEST_STEP = 1e-2  # of a width
 
 
 def ranges_of(log: Log) -> Array:
@@ -38,9 +44,34 @@ def shares_inside(log: Log, ranges: Array, margin: float) -> Array:
     middle = (low + high) / 2
     for index in log.space.angles:
         values[:, index] -= whole_turns(values[:, index] - middle[index])
-    tolerance = margin * (high - low) + 1e-12
+    # Of what never moves, the round-off.
+    rounding = _ROUNDING * np.maximum(np.abs(low), np.abs(high))
+    tolerance = margin * (high - low) + rounding
     inside = (values >= low - tolerance) & (values <= high + tolerance)
     return inside.mean(axis=0)
+
+
+def widths_of(values: Array) -> Array:
+    """Returns the ranges (c,) of values (K, c): of still ones their size, or one."""
+    ranges = np.ptp(values, axis=0)
+    sizes = np.abs(values).max(axis=0)
+    return np.where(ranges > 0, ranges, np.where(sizes > 0, sizes, 1.0))
+
+
+def state_widths(space: StateSpace, states: Array) -> Array:
+    """Returns the widths (e,) of the entries of states (K, n), as of ``widths_of``."""
+    return widths_of(space.difference(states, space.origin))
+
+
+def difference_steps(values: Array) -> Array:
+    """Returns steps (c,) for differences of functions of values (K, c).
+
+    They are a small share of the widths, and more than round-off of large values.
+    """
+    widths = widths_of(values)
+    sizes = np.abs(values).max(axis=0)
+    least = _STEP * widths
+    return np.clip(_STEP_OF_SIZE * sizes, least, _LARGEST_STEP * widths)
 
 
 def _rows(log: Log) -> Array:

@@ -332,10 +332,8 @@ def _without_chance(shares: Array, errors: Array, regret: _Regret) -> Array:
     of_single = regret.by_stretch(errors[single])
     gains = of_single - regret.by_stretch(_average(shares, errors))
     gain = gains.mean()
-    if gain <= 0:
+    if gain <= 0 or len(gains) < 2:  # of one stretch all may be chance
         return np.eye(len(shares))[single]
-    if len(gains) < 2:
-        return shares
     variance = gains.var(ddof=1) / len(gains)
     kept = gain**2 / (gain**2 + variance)
     moved = kept * shares

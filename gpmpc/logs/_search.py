@@ -322,11 +322,14 @@ class Search:
         groups = self._groups_with_residual(start)
         if not groups:
             return
-        all_groups = self._averaged_least(start, groups)
+        averages = self._averages(start)
+        if not averages:
+            return
+        all_groups = self._averaged_least(start, groups, averages)
         rows = all_groups.gps[0].rows
         for current in (start, all_groups):
             for _ in range(_ROUNDS):
-                changed = self._changed_gps(current, groups, rows)
+                changed = self._changed_gps(current, groups, rows, averages)
                 for structure in changed:
                     self._consider_gps(structure)
                 best = self._ranked([current, *changed])[0]
@@ -370,13 +373,24 @@ class Search:
                 return
             current = best
 
-    def _averaged_least(self, start: Structure, groups: Sequence[str]) -> Structure:
+    def _averages(self, start: Structure) -> tuple[int, ...]:
+        """Returns the rows that targets may be averaged over.
+
+        Every fold needs a piece of so many upon those that the structure looks back on.
+        """
+        longest = min(fold.train.longest_piece for fold in self._folds)
+        most = longest - start.model.past - 1
+        return tuple(rows for rows in _AVERAGES if rows <= most)
+
+    def _averaged_least(
+        self, start: Structure, groups: Sequence[str], averages: Sequence[int]
+    ) -> Structure:
         """Returns the structure with GPs on all groups, averaged over the best rows.
 
         Targets are averaged over fewer rows while that helps.
         """
         best: Structure | None = None
-        for rows in sorted(_AVERAGES, reverse=True):
+        for rows in sorted(averages, reverse=True):
             structure = start.with_gps(GroupGP(group, rows) for group in groups)
             self._consider_gps(structure)
             if best is not None and self.score(structure) >= self.score(best):
@@ -399,7 +413,11 @@ class Search:
         return tuple(name for name, own in groups.items() if is_left[list(own)].any())
 
     def _changed_gps(
-        self, structure: Structure, groups: Sequence[str], rows: int
+        self,
+        structure: Structure,
+        groups: Sequence[str],
+        rows: int,
+        averages: Sequence[int],
     ) -> list[Structure]:
         """Returns a structure with a GP more or less, or averaged over other rows."""
         with_gp = {gp.group for gp in structure.gps}
@@ -411,7 +429,7 @@ class Search:
             changed.append(structure.with_gps(others))
         if len(with_gp) == 1:
             (group,) = with_gp
-            changed += [structure.with_gps([GroupGP(group, n)]) for n in _AVERAGES]
+            changed += [structure.with_gps([GroupGP(group, n)]) for n in averages]
         return [one for one in changed if one.key != structure.key]
 
     def _consider_gps(self, structure: Structure) -> None:

@@ -26,12 +26,14 @@ from gpmpc._dynamics import Array
 from gpmpc.logs._fitting import fit_least_squares
 from gpmpc.logs._log import Log, LogRun
 from gpmpc.logs._output_gps import train_output_gp
+from gpmpc.logs._ranges import difference_steps, state_widths
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._log_model import LogModel
 
-_DIFFERENCE = 1e-6
+_ROUNDING = 1e-12  # of a state's range: least noise
 _SIGNIFICANT = 4.0  # standard errors by which a noise has to differ from none
 _LEAST_SHARE = 0.02  # of the residuals' variance that a noise has to make up
+_WINDOWS = 100_000  # whose residuals tell the noise, at most
 _LAGS = 10  # over which what a model misses is correlated
 _MODELS = 3  # that are fitted in turn
 _LINEARIZATIONS = 2  # about the rows as they were, then about those smoothed by them
@@ -62,6 +64,8 @@ def smooth(log: Log, kinematics: Kinematics, seed: int) -> Log | None:
         The log with the most likely states; None where there is no white noise in any
         of its rows.
     """
+    if log.longest_piece <= _LAGS + 1:
+        return None  # too short to tell noise from what a model misses
     smoothed = log
     is_smoothed = False
     for number in range(_MODELS):
@@ -97,7 +101,7 @@ def _with_gps(model: LogModel, log: Log, seed: int) -> LogModel:
 
 def _estimate_noise(model: LogModel, log: Log) -> _Noise:
     """Estimates the noise from the residuals of a model one step ahead."""
-    windows = log.windows(_LAGS + 1)
+    windows = log.windows(_LAGS + 1, most=_WINDOWS)
     states = windows.states[:, :-1]
     inputs = windows.inputs[:, :-1]
     context = np.broadcast_to(
@@ -117,7 +121,8 @@ def _estimate_noise(model: LogModel, log: Log) -> _Noise:
     standard_error = products.std(axis=0) / np.sqrt(len(products))
     least = np.maximum(_SIGNIFICANT * standard_error, _LEAST_SHARE * variance)
     is_noisy = least < R
-    floor = _NONE * variance + 1e-24
+    widths = state_widths(windows.space, states.reshape(-1, states.shape[-1]))
+    floor = _NONE * variance + np.square(_ROUNDING * widths)
     R = np.where(is_noisy, R, floor)
     Q = np.maximum(density, np.maximum(_STIFF * R, floor))
     return _Noise(R, Q, is_noisy)
@@ -174,9 +179,9 @@ def _linearized_steps(
 
     predicted = predict(states)
     columns = []
-    for h in _DIFFERENCE * np.eye(space.error_dim):
+    for h in np.diag(difference_steps(space.difference(states, space.origin))):
         displaced = predict(space.displace(states, h))
-        columns.append(space.difference(displaced, predicted) / _DIFFERENCE)
+        columns.append(space.difference(displaced, predicted) / h.sum())
     residuals = space.difference(predicted, run.states[1:])
     return np.stack(columns, axis=-1), residuals
 

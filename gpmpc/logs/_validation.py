@@ -74,6 +74,7 @@ class Validations:
         self._judged_steps = judged_steps
         self._validations: dict[str, list[_Validation]] = {}
         self._models: dict[str, list[LogModel]] = {}  # of the folds, corrected
+        self._fold_rollouts: dict[str, list[Rollouts]] = {}
         states = np.concatenate([run.states for run in log])
         low = states.min(axis=0)
         high = states.max(axis=0)
@@ -89,7 +90,8 @@ class Validations:
         There is none where rollouts diverge on all that a model was not fitted to.
         """
         parts = [one.rollouts for one in self._validate(structure)]
-        if not all(len(rollouts.windows) for rollouts in parts):
+        parts_of_folds = self._rollouts_of_folds(structure)
+        if not all(len(rollouts.windows) for rollouts in (*parts, *parts_of_folds)):
             return None
         return choose_averages(
             kinematics=structure.model.kinematics,
@@ -104,10 +106,7 @@ class Validations:
         if not structure.shares:
             return models
         if structure.key not in self._models:
-            rollouts = [
-                self._rollouts(model, fold.held_out)
-                for model, fold in zip(models, self._folds, strict=True)
-            ]
+            rollouts = self._rollouts_of_folds(structure)
             # What one fold holds out, the models of the others were fitted to.
             self._models[structure.key] = [
                 self._correct(
@@ -119,6 +118,17 @@ class Validations:
                 for i, (model, fold) in enumerate(zip(models, self._folds, strict=True))
             ]
         return self._models[structure.key]
+
+    def _rollouts_of_folds(self, structure: Structure) -> list[Rollouts]:
+        """Rolls the models of the folds out on what is held out, uncorrected."""
+        key = structure.uncorrected.key
+        if key not in self._fold_rollouts:
+            models = self._fits.models(structure)
+            self._fold_rollouts[key] = [
+                self._rollouts(model, fold.held_out)
+                for model, fold in zip(models, self._folds, strict=True)
+            ]
+        return self._fold_rollouts[key]
 
     def fit_noise(self, structure: Structure) -> OutputNoise:
         """Fits the noise of a structure to the errors of its rollouts."""

@@ -241,17 +241,24 @@ def test_learn_writes_its_three_files_and_names_mistakes(tmp_path):
 
 
 def test_runs_that_are_too_short_to_judge_on_are_refused_first(tmp_path):
-    rows = "\n".join(f"{0.1 * k},{k % 7},{k % 5}" for k in range(60))
-    (tmp_path / "short.csv").write_text(f"t,x,u\n{rows}\n")
+    rows = [f"{0.1 * k},{k % 7},{k % 5}" for k in range(60)]
+    short = tmp_path / "short.csv"
+    short.write_text("\n".join(["t,x,u", *rows[:50], ""]))
     (tmp_path / "map.yaml").write_text("time: t\nstates: {x: [x]}\ninputs: {u: [u]}")
     result = forked("learn", "map.yaml", "short.csv", cwd=tmp_path)
     expected = (
-        "gpmpc: short, last part: judging 50 steps ahead needs 71 rows without a gap; "
-        "the longest piece that is held out has 12: hold out longer runs, or ask for "
-        "fewer steps\n"
+        "gpmpc: learning needs 54 rows without a gap; the longest piece to learn from "
+        "has 48: log longer runs, or resample over gaps (rate and max_gap)\n"
     )
     assert (result.returncode, result.stderr) == (2, expected)
     assert not (tmp_path / "learned").exists()
+    # A few rows more are learned from, and judged as far ahead as they tell.
+    short.write_text("\n".join(["t,x,u", *rows, ""]))
+    result = forked("learn", "map.yaml", "short.csv", "--for-control", cwd=tmp_path)
+    assert result.returncode in (0, 3), result.stderr
+    assert "short log: rollouts of 2 steps decide, not of 50" in result.stdout
+    assert "at most 1 steps ahead: of predictions more than 1 step" in result.stdout
+    assert "Judged 1 ahead" in (tmp_path / "learned" / "report.md").read_text()
 
 
 def run_of(rows, name="run"):
@@ -271,7 +278,7 @@ def run_of(rows, name="run"):
 def test_runs_of_middle_length_are_held_out_by_default(lengths, held_out):
     runs = tuple(run_of(rows + 30, f"{rows}") for rows in lengths)
     mapping = LogMapping.from_dict({"states": {"x": ["x"]}, "inputs": {"u": ["u"]}})
-    _, judged = _split(Log(mapping, 0.1, runs), [])
+    judged = _split(Log(mapping, 0.1, runs), []).held_out(20)
     assert sorted(len(run) - 30 for run in judged) == held_out
 
 

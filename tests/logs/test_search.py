@@ -7,20 +7,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gp import train
 from gpmpc.logs import Log, LogMapping, fit_nominal, judge, learn
 from gpmpc.logs._baselines import baseline_errors
 from gpmpc.logs._comparison import compare
 from gpmpc.logs._control_fitness import _linearize, judge_for_control
+from gpmpc.logs._fitting import _standard_errors, fit_least_squares
 from gpmpc.logs._folds import split_folds
+from gpmpc.logs._learning import _plan_folds
 from gpmpc.logs._log import LogRun
-from gpmpc.logs._noise import learning_gains
+from gpmpc.logs._noise import _nonnegative_solution, learning_gains
 from gpmpc.logs._ranges import ranges_of
 from gpmpc.logs._rollout_corrections import (
     _PRIORS,
     _RIDGE,
+    _ROLLOUT,
     Rollouts,
+    _Regret,
+    _without_chance,
     choose_averages,
 )
 from gpmpc.logs._search import Search
@@ -166,12 +171,35 @@ def test_inputs_that_act_late_are_known_to_controllers():
     assert "inputs 3 rows late" in search.best.name
 
 
+@pytest.mark.parametrize("control", [False, True])
+def test_a_short_run_is_learned_by_few_steps(control):
+    """A GP whose targets are averaged over ten rows has no windows in its halves."""
+    log = reactor_log(55)
+    lines = []
+    learned = learn(log, points=10, progress=lines.append, for_control=control)
+    assert "short log: rollouts of 2 steps decide, not of 50" in lines
+    names = [one.name for one in learned.candidates]
+    assert not any("disturbance, GP" in name and "over 10" in name for name in names)
+    with pytest.raises(DataError, match="needs 54 rows without a gap"):
+        learn(reactor_log(53), points=10)
+    # The longest run alone is no measure of what the others hold.
+    long, *short = np.split(reactor_log(250).runs[0].states, [90, 130, 170, 210])
+    lengths = [len(long), *map(len, short)]
+    runs = log_of([long, *short], [np.zeros((rows, 1)) for rows in lengths])
+    plan = _plan_folds(runs, 50, for_control=False)
+    assert 10 <= plan.steps <= 20
+
+
 def test_what_is_slower_than_all_that_is_sought_is_no_delay():
     commands = held_inputs(np.random.default_rng(0), 400, 1.0, hold=4)
     acting = np.vstack([np.zeros((30, 1)), commands[:370]])
     states = simulate(lambda x, u: [x[1], 4 * u[0] - 2 * x[1]], [0, 0], acting)
     assert rows_late(log_of([states], [np.zeros_like(commands)]), reach=40) == 0
     assert rows_late(log_of([states], [commands]), reach=0) == 0
+    # The longest delay that is sought is found.
+    acting = np.vstack([np.zeros((15, 1)), commands[:385]])
+    states = simulate(lambda x, u: [x[1], 4 * u[0] - 2 * x[1]], [0, 0], acting)
+    assert rows_late(log_of([states], [commands]), reach=40) == 15
 
 
 def test_runs_are_dealt_so_that_ranges_are_covered():
@@ -366,6 +394,33 @@ def test_averages_take_what_is_best_on_other_runs():
     assert (ratios(measured + 10 * errors) < 0.2).all()
 
 
+@pytest.mark.parametrize(
+    ("widths", "width_of_input", "offset"),
+    [([1e-9, 1e5], 1e-6, 0.0), ([1e-9, 1e-9], 1e-9, 0.0), ([1.0, 1e3], 1e4, 1e6)],
+)
+def test_units_and_origins_change_nothing(widths, width_of_input, offset):
+    """A pressure in Pa beside an opening in nm, and places far from their origin."""
+    log = reactor_log(160)
+    run = log.runs[0]
+    scaled = replace(
+        run,
+        states=np.array(widths) * (run.states + offset),
+        inputs=width_of_input * (run.inputs + offset),
+    )
+    errors = []
+    for one, scale in ((run, 1.0), (scaled, np.array(widths))):
+        part = replace(log, runs=(one,))
+        search = tiny_search(part, for_control=True)
+        search._search_nominals()
+        relative = {key: value / scale for key, value in search._errors.items()}
+        fitness = judge_for_control(search._fits.models(search.best)[0], part, {})
+        errors.append((search.best.name, relative, fitness.faults))
+    assert errors[0][0] == errors[1][0] != "constant state"
+    assert errors[0][2] == errors[1][2]
+    for key, expected in errors[0][1].items():
+        np.testing.assert_allclose(errors[1][1][key], expected, rtol=1e-3)
+
+
 def test_what_runs_have_each_for_themselves_is_not_corrected():
     rng = np.random.default_rng(1)
     levels = rng.normal(size=(6, 2))
@@ -415,28 +470,67 @@ def test_intervals_of_a_comparison_hold():
         rng = np.random.default_rng(seed)
         distances = rng.exponential(1.0, (400, 1, 1))
         others = rng.exponential(2.0, (400, 1, 1))
-        one = compare("other", distances, others, block=5, seed=seed)
+        one = compare("other", distances, others, block=5, independent=[400], seed=seed)
         hits += bool(one.low < 0.5 < one.high)
         assert one.high - one.low < 0.25
     assert hits >= 33  # of 38 expected, with a standard error of 1.4
-    again = compare("other", distances, others, block=5, seed=39)
+    again = compare("other", distances, others, block=5, independent=[400], seed=39)
     np.testing.assert_array_equal(one.low, again.low)
+    # Of a few independent errors it is wider; of fewer than four nothing is told.
+    few = compare("other", distances, others, block=5, independent=[4], seed=39)
+    assert few.high / few.low > (again.high / again.low) ** 1.5
+    none = compare("other", distances, others, block=5, independent=[3.9], seed=39)
+    assert (none.low.item(), none.high.item()) == (0.0, np.inf)
+    assert none.ratio == again.ratio
+
+
+def test_windows_that_overlap_are_one_error():
+    """Of ten windows that share their rows a mean is known no better than of one."""
+    signs = np.tile([1.0, -1.0], 8)
+    residuals = np.repeat(1e-3 * signs, 10)[:, None]
+    errors = [
+        _standard_errors(np.ones((160, 1)), residuals, block) for block in (1, 10)
+    ]
+    np.testing.assert_allclose(errors[1] / errors[0], np.sqrt(10), rtol=1e-3)
+
+
+def test_noise_is_fitted_to_what_is_finite():
+    regressors = np.array([[1.0, 0.0], [np.inf, 1.0], [0.0, 2.0], [np.nan, 0.0]])
+    solution = _nonnegative_solution(regressors, np.array([1.0, 5.0, 4.0, 7.0]))
+    np.testing.assert_allclose(solution, [1.0, 2.0])
+
+
+def test_one_stretch_tells_no_average_from_chance():
+    """Its errors are least where two corrections are averaged."""
+    errors = np.full((len(_PRIORS), 20, 1), 2.0)
+    errors[_ROLLOUT] = 1.0
+    errors[_ROLLOUT + 1] = -0.9
+    shares = np.zeros(len(_PRIORS))
+    shares[[_ROLLOUT, _ROLLOUT + 1]] = 0.5
+    one = _Regret(errors, np.zeros(20, dtype=int))
+    assert _without_chance(shares, errors, one)[_ROLLOUT] == 1.0
+    two = _Regret(errors, np.repeat([0, 1], 10))
+    np.testing.assert_allclose(_without_chance(shares, errors, two), shares)
 
 
 def test_a_window_that_diverges_spoils_no_comparison():
     rng = np.random.default_rng(0)
     distances = rng.exponential(1.0, (400, 1, 1))
     others = rng.exponential(2.0, (400, 1, 1))
-    expected = compare("other", distances[1:], others[1:], block=5, seed=0)
+    expected = compare(
+        "other", distances[1:], others[1:], block=5, independent=[400], seed=0
+    )
     distances[0] = 1e20  # once, whose draws are few
-    once = compare("other", distances, others, block=5, seed=0)
+    once = compare("other", distances, others, block=5, independent=[400], seed=0)
     assert abs(once.low - expected.low) < 0.1
     for wrong in (np.inf, np.nan):
         distances[0] = wrong
-        one = compare("other", distances, others, block=5, seed=0)
+        one = compare("other", distances, others, block=5, independent=[400], seed=0)
         assert np.isfinite([one.low, one.high, one.ratio]).all()
         assert one.low < 1 < one.ratio
-        both = compare("other", distances, distances, block=5, seed=0)
+        both = compare(
+            "other", distances, distances, block=5, independent=[400], seed=0
+        )
         np.testing.assert_array_equal([both.low, both.high], 1.0)
 
 
@@ -505,6 +599,30 @@ def test_a_model_that_no_controller_should_use_is_named():
 
 # of [c, T, u, 1] for each rate of change
 THETA = np.array([0, 1, 0, 0, -1, -0.5, 2, 0], dtype=float)
+
+
+@pytest.mark.parametrize(
+    ("rates", "start", "measured", "is_hidden"),
+    [
+        (lambda x, u: [x[1], -9 * x[0] - 2 * x[1] + 9 * u[0]], [0, 0], [0], True),
+        (lambda x, u: [x[1], -9 * x[0] - 2 * x[1] + 9 * u[0]], [0, 0], [0, 1], False),
+        (lambda x, u: [3 * (u[0] - x[0]), 0], [0, 0], [0], False),
+    ],
+)
+def test_a_position_without_its_velocity_is_no_state(rates, start, measured, is_hidden):
+    """Where the rows before say where it goes, noise or not."""
+    rng = np.random.default_rng(0)
+    inputs = held_inputs(rng, 600, 1.0, hold=20)
+    states = simulate(rates, start, inputs)[:, measured]
+    states += 1e-3 * rng.normal(size=states.shape)
+    signals = {name: [name] for name in "ab"[: len(measured)]}
+    mapping = LogMapping.from_dict({"states": signals, "inputs": {"u": ["u"]}})
+    log = log_of([states], [inputs], mapping)
+    model = fit_least_squares(Increments(log.space), log)
+    faults = judge_for_control(model, log, {}).faults
+    said = [fault for fault in faults if "do not say where they go" in fault]
+    assert len(said) == len(faults) == is_hidden
+    assert all("Add the velocity" in fault for fault in said)
 
 
 def test_a_feedback_that_fails_on_a_rival_is_told():
@@ -592,7 +710,7 @@ def test_a_losing_model_says_so_first_and_ends_with_code_3(tmp_path):
     assert "1 / 5 steps ahead" in (tmp_path / "learned" / "report.md").read_text()
 
 
-def tiny_search(log):
+def tiny_search(log, for_control=False):
     """A search whose bases were considered, and nothing else."""
     search = Search(
         log=log,
@@ -603,7 +721,7 @@ def tiny_search(log):
         seed=0,
         progress=lambda text: None,
         memory={},
-        for_control=False,
+        for_control=for_control,
     )
     for base in bases(log, 40):
         search._consider_nominal(base, parent=None)
