@@ -233,6 +233,8 @@ def _draw_errors(axis: Axes, judgement: "Judgement", group: int) -> None:
         title=figure_label(judgement.groups[group]),
         ylabel=f"mean error [{figure_label(judgement.units[group])}]",
     )
+    if not any((errors[:, group] > 0).any() for errors in judgement.mean.values()):
+        axis.set_yscale("linear")  # of a state that never moves
 
 
 def _draw_intervals(axis: Axes, judgement: "Judgement", group: int) -> None:

@@ -252,6 +252,12 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
     nothing = replace(wrong.model, theta=np.full_like(wrong.model.theta, np.nan))
     judgement = judge(replace(wrong, model=nothing), held_out, train, steps=(1, 10))
     assert any("constant velocity" in loss for loss in judgement.losses)
+    # Two predictions of ten steps tell nothing, and twenty of one step do.
+    rows = held_out.runs[0].part(0, needed + 28, "few")
+    few = judge(wrong, replace(held_out, runs=(rows,)), train, steps=(1, 10))
+    assert few.steps_not_told == (10,)
+    assert few.losses
+    assert not any("10 steps ahead" in loss for loss in few.losses)
     # Of short pieces the baselines are fitted to fewer steps.
     short = [replace(run, begins=tuple(range(0, 500, 70))) for run in train]
     train = replace(train, runs=tuple(short))

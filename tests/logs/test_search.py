@@ -9,7 +9,7 @@ import pytest
 
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gp import train
-from gpmpc.logs import Log, LogMapping, fit_nominal, judge, learn
+from gpmpc.logs import Judgement, Log, LogMapping, fit_nominal, judge, learn
 from gpmpc.logs._baselines import baseline_errors
 from gpmpc.logs._comparison import compare
 from gpmpc.logs._control_fitness import _linearize, judge_for_control
@@ -41,6 +41,7 @@ from gpmpc.models import LogModel
 from gpmpc.models._correction import Correction, Prior
 from gpmpc.models._kinematics import Increments
 from gpmpc.models._parametric import AffineNominal
+from gpmpc.plotting import judgement_figure
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 from tests.cli.command import forked
@@ -498,6 +499,23 @@ def test_noise_is_fitted_to_what_is_finite():
     regressors = np.array([[1.0, 0.0], [np.inf, 1.0], [0.0, 2.0], [np.nan, 0.0]])
     solution = _nonnegative_solution(regressors, np.array([1.0, 5.0, 4.0, 7.0]))
     np.testing.assert_allclose(solution, [1.0, 2.0])
+
+
+def test_a_state_that_never_moves_is_drawn(recwarn):
+    nothing = np.zeros((2, 1))
+    judgement = Judgement(
+        groups=("pressure",),
+        units=("Pa",),
+        steps=(1, 10),
+        mean={"model": nothing, "constant state": nothing},
+        rmse={"model": nothing, "constant state": nothing},
+        coverage=nothing + 1,
+        coverage_interval=np.ones((2, 1, 2)),
+        width=nothing + 1,
+        windows=20,
+    )
+    judgement_figure(judgement).canvas.draw()
+    assert not recwarn.list
 
 
 def test_one_stretch_tells_no_average_from_chance():
