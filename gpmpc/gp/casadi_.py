@@ -312,3 +312,17 @@ def _tape_rows(code: Array, constants: Array) -> list[list[int]]:
             f"code must be whole numbers, zero or more; got {code[~whole][0]}"
         )
     return code.astype(np.int64).tolist()
+
+
+def jacobian_of(function: casadi.Function) -> casadi.Function:
+    """Returns the derivatives of a value by all arguments side by side.
+
+    Entries of the value are taken column by column.
+    """
+    is_tape = function.is_a("SXFunction")
+    arguments = function.sx_in() if is_tape else function.mx_in()
+    value = casadi.vec(function(*arguments))
+    parts = [casadi.jacobian(value, argument) for argument in arguments]
+    return casadi.Function(
+        f"{function.name()}_jacobian", arguments, [casadi.horzcat(*parts)]
+    )

@@ -72,17 +72,9 @@ class CasadiFunction:
     @cached_property
     def jacobian(self) -> "CasadiFunction":
         """Derivatives of the value, column by column, by all arguments side by side."""
-        import casadi
+        from gpmpc.gp.casadi_ import jacobian_of  # loads CasADi
 
-        is_tape = self.function.is_a("SXFunction")
-        arguments = self.function.sx_in() if is_tape else self.function.mx_in()
-        value = casadi.vec(self.function(*arguments))
-        parts = [casadi.jacobian(value, argument) for argument in arguments]
-        return CasadiFunction(
-            casadi.Function(
-                f"{self.function.name()}_jacobian", arguments, [casadi.horzcat(*parts)]
-            )
-        )
+        return CasadiFunction(jacobian_of(self.function))
 
     def check_sizes(self, arguments: tuple[int, ...], value: tuple[int, int]) -> None:
         """Raises ``UnsupportedModel`` unless arguments and value have these sizes."""

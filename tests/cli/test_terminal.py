@@ -462,7 +462,7 @@ def test_an_interrupted_command_says_whether_it_goes_on(words, goes_on, monkeypa
     monkeypatch.setattr(_main, "_call", interrupt)
     monkeypatch.setattr(_main, "_run_with_settings", interrupt)
     with pytest.raises(KeyboardInterrupt) as caught:
-        _main._run(words, debug=False)
+        _main._run(words, as_json=False, debug=False)
     advice = "the same command goes on where it stopped"
     assert str(caught.value) == (advice if goes_on else "")
 

@@ -228,8 +228,12 @@ def test_what_misses_a_bound_by_rounding_is_put_onto_it():
 def test_a_non_finite_reference_is_no_fallback():
     lost = Gaussian.certain(START * np.nan)
     reference = Reference(REFERENCES.states[: H + 1], np.full((H, 3), np.nan))
+    command = decide(Liar(), lost, reference, None, "hold")
+    assert np.array_equal(command.input, Liar.initial_input)
+    controller = Liar()
+    controller.initial_input = None
     with pytest.raises(SolverFailure, match="no reference input to fall back on"):
-        decide(Liar(), lost, reference, None, "hold")
+        decide(controller, lost, reference, None, "hold")
 
 
 def test_without_declared_bounds_inputs_are_finite_and_as_many():
