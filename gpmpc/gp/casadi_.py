@@ -320,7 +320,7 @@ def jacobian_of(function: casadi.Function) -> casadi.Function:
     Entries of the value are taken column by column.
     """
     is_tape = function.is_a("SXFunction")
-    arguments = function.sx_in() if is_tape else function.mx_in()
+    arguments: list[Any] = function.sx_in() if is_tape else function.mx_in()
     value = casadi.vec(function(*arguments))
     parts = [casadi.jacobian(value, argument) for argument in arguments]
     return casadi.Function(
