@@ -18,11 +18,15 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
+from gpmpc.mpc._condense import condense
+from gpmpc.mpc._guess import initial_guess, read_request
+from gpmpc.mpc._priced_solver import PricedSolver
+from gpmpc.mpc._stopwatch import Stopwatch
 from gpmpc.propagation import Linearization
 from gpmpc.qp import DualActiveSet
 from gpmpc.qp import _record as layout
 from gpmpc.status import Status
-from tests.mpc.small_models import LinearGaussian
+from tests.mpc.small_models import LinearGaussian, double_integrator
 
 H = 12
 
@@ -333,3 +337,44 @@ def test_a_solution_stays_where_the_one_of_a_lower_price_fails():
     assert decision.status is Status.SOFT_BOUND_MISSED
     exact = planned("exact", [2.0, 0.0], push=8.0)
     np.testing.assert_allclose(decision.inputs, exact.inputs, atol=1e-7)
+
+
+def test_each_elastic_row_is_priced_once_a_step():
+    """A row that a later program misses is priced as well; the first keeps its price."""
+    place = Box([-np.inf, -np.inf], [1.0, np.inf], penalty="elastic")
+    speed = Box([-np.inf, -np.inf], [np.inf, 0.5], penalty="elastic")
+    problem = Problem(
+        Tracking([1.0, 0.1], [0.1]),
+        inputs=Box([-1.0], [1.0]),
+        constraints=[place, speed],
+    )
+    controller = GPMPC(
+        double_integrator(), Linearization(), problem, horizon=8, initial_input=[0.0]
+    )
+    prediction = controller.prediction
+    exact_prices = prediction.constraints.prices
+    reference = Reference(np.zeros(2))
+    solver = None
+    prices = []
+    for start in ([2.0, 0.0], [-3.0, 3.0]):
+        request = read_request(prediction, Gaussian.certain(start), reference, None)
+        local = prediction.linearize(initial_guess(prediction, request), request)
+        program = condense(
+            cost=local.cost,
+            bounds=prediction.program_bounds,
+            stages=local.stages,
+            start=local.plan.states[0],
+            references=request.references,
+            rows=local.rows,
+        )
+        if solver is None:
+            solver = PricedSolver(
+                prediction, DualActiveSet(), request, stopwatch=Stopwatch()
+            )
+        solver.look_again()
+        assert solver.solve(program, local, warm_start=None).status is Status.SOLVED
+        prices.append(solver.row_prices)
+    is_lowered = [after < exact_prices for after in prices]
+    assert is_lowered[0].tolist() == [True, False]
+    assert is_lowered[1].tolist() == [True, True]
+    assert prices[1][0] == prices[0][0]
