@@ -340,7 +340,7 @@ def test_a_solution_stays_where_the_one_of_a_lower_price_fails():
 
 
 def test_each_elastic_row_is_priced_once_a_step():
-    """A row that a later program misses is priced as well; the first keeps its price."""
+    """A row that a later program misses is priced, too; the first keeps its price."""
     place = Box([-np.inf, -np.inf], [1.0, np.inf], penalty="elastic")
     speed = Box([-np.inf, -np.inf], [np.inf, 0.5], penalty="elastic")
     problem = Problem(
