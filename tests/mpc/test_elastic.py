@@ -19,6 +19,7 @@ from gpmpc.mpc import (
     Tracking,
 )
 from gpmpc.mpc._condense import condense
+from gpmpc.mpc._elastic import are_kept_again
 from gpmpc.mpc._guess import initial_guess, read_request
 from gpmpc.mpc._priced_solver import PricedSolver
 from gpmpc.mpc._stopwatch import Stopwatch
@@ -378,3 +379,15 @@ def test_each_elastic_row_is_priced_once_a_step():
     assert is_lowered[0].tolist() == [True, False]
     assert is_lowered[1].tolist() == [True, True]
     assert prices[1][0] == prices[0][0]
+
+
+@pytest.mark.parametrize(
+    ("violations", "is_kept"),
+    [
+        ([0.3, 0.1, 0.0, 0.0], True),
+        ([0.0, 0.0, 0.1, 0.3], False),
+        ([0.3, 0.3, 0.3, 0.3 + 1e-15], True),  # as far as rounding lets one tell
+    ],
+)
+def test_a_bound_is_kept_again_where_it_is_missed_early(violations, is_kept):
+    assert are_kept_again(np.array(violations)[:, None]) is is_kept
