@@ -517,10 +517,12 @@ def _learned_so_far(
         if hasattr(learned, "with_input_of_policy"):
             return learned.with_input_of_policy(input)
         return learned
-    learned: Any = None
-    if last is not None and last.plan is not None:
-        learned = last.plan.learned
-    return learned.later() if hasattr(learned, "later") else learned
+    if last is None or last.plan is None:
+        return None
+    last_learned = last.plan.learned
+    if hasattr(last_learned, "later"):
+        return last_learned.later()
+    return last_learned
 
 
 def _plan_of_policy(
