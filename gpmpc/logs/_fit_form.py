@@ -37,7 +37,7 @@ def fit_from(
     log: Log,
     steps: int,
     choose_penalties: Callable[[LogModel], Array],
-    same_log: bool = False,
+    starts_on_same_log: bool = False,
 ) -> NominalFit:
     """Fits a model but for its GPs.
 
@@ -48,12 +48,12 @@ def fit_from(
         log: The data.
         steps: Of the rollouts.
         choose_penalties: Of a linear term, by the model with its nominal part (o,).
-        same_log: Whether ``start_from`` was fitted to the same log. Then a linear term
-            comes upon its nominal part, where the model has the same.
+        starts_on_same_log: Whether ``start_from`` was fitted to this log. Then a linear
+            term comes upon its nominal part, where the model has the same.
     """
     if model.memory.empty:
         return _fit_nominal_part(start_from, model, log, steps)
-    if same_log and _has_equal_nominal_part(start_from, model):
+    if starts_on_same_log and _has_equal_nominal_part(start_from, model):
         model = replace(
             model, theta=start_from.theta, time_constants=start_from.time_constants
         )
@@ -121,6 +121,8 @@ def _fit_affine(model: LogModel, log: Log, steps: int) -> LogModel:
     nominal = model.nominal
     assert isinstance(nominal, AffineNominal)
     if not nominal.fitted and len(model.time_constants):
+        # The lags are for the inputs of a memory's linear term, which is fitted later:
+        # those with which an affine part predicts best are right for it as well.
         fitted = replace(model, nominal=replace(nominal, fitted=True))
         lags = _fit_affine(fitted, log, steps).time_constants
         return replace(model, time_constants=lags)
@@ -146,8 +148,7 @@ class _LagTrials:
     def __init__(self, model: LogModel, log: Log, steps: int):
         self._model = model
         self._log = log
-        past = max(model.past, PAST)
-        self._windows = log.windows(steps, past=past, most=_WINDOWS)
+        self._windows = log.windows(steps, past=max(model.past, PAST), most=_WINDOWS)
         self._steps = sorted({min(step, steps) for step in _JUDGED})
         self._at_rest = distances_at_rest(self._windows, self._steps)
 
@@ -166,8 +167,9 @@ class _LagTrials:
 
 def _fit_affine_part(model: LogModel, log: Log) -> LogModel:
     """Fits an affine nominal part one step ahead on all rows."""
-    past = max(model.past, PAST) if len(model.time_constants) else model.past
-    windows = log.windows(1, past=past)
+    has_lags = len(model.time_constants) > 0
+    least_past = PAST if has_lags else 0
+    windows = log.windows(1, past=max(model.past, least_past))
     still = replace(
         model,
         nominal=AffineNominal(model.kinematics, fitted=False),

@@ -40,7 +40,7 @@ _FEWEST_BLOCKS = 8  # of consecutive windows, whose errors are correlated
 _FIRST_TIME_CONSTANT = 0.03  # [s] of a first-order lag, at which the search begins,
 _FIRST_STEPS = (1.0, 30.0)  # or this many time steps at least and at most
 _ROUNDING = 1e-12  # of a state's range: least error of one that does not move
-_EXACT = 1e-9  # of an error at rest: what is smaller counts as exact
+_EXACT_SHARE = 1e-9  # of an error at rest: what is smaller counts as exact
 _DIVERGED = 1e6  # residual of a rollout that is not finite
 
 
@@ -108,7 +108,8 @@ def fit_nominal(
     residuals = _RolloutResiduals(model, windows, steps, bounds, sizes)
     theta = _minimize(residuals, theta0)
     if lags and theta[count:].min() <= 0 and theta0[-1] > log.time_step:
-        # The search jumped below zero, where nothing pulls a lag back.
+        # The search jumped below zero. There lags act as none (``FirstOrderLags``), and
+        # nothing pulls them back.
         from_a_step = np.concatenate([theta0[:count], np.full(lags, log.time_step)])
         theta = min(theta, _minimize(residuals, from_a_step), key=residuals.loss)
     time_constants = np.maximum(theta[count:], 0.0)
@@ -156,13 +157,15 @@ def _minimize(residuals: "_RolloutResiduals", theta0: Array) -> Array:
 
 
 def _bounds(model: LogModel, lags: int) -> tuple[Array, Array]:
-    """Returns the smallest and largest parameters (P,), those of the lags behind."""
+    """Returns the smallest and largest parameters (P,), those of the lags last."""
     count = len(model.nominal.parameter_names)
     infinite = np.full(count, np.inf)
     low, high = getattr(model.nominal, "bounds", (-infinite, infinite))
     if not (np.asarray(low) < np.asarray(high)).all():
         rule = "must have a low below its high for every parameter"
         raise SettingError("bounds", f"{rule}; got {low} and {high}")
+    # Lags have no bound at zero, where many searches would stop: negative ones act as
+    # none.
     endless = np.full(lags, np.inf)
     return np.concatenate([low, -endless]), np.concatenate([high, endless])
 
@@ -202,13 +205,13 @@ class _RolloutResiduals:
     def of_windows(self, theta: Array) -> Array:
         """Computes the residuals (T, W, steps, e) of parameter vectors (T, P)."""
         size = max(_BATCH // len(self._windows), 1)
-        parts = []
+        batches = []
         for first in range(0, len(theta), size):
             batch = theta[first : first + size]
             predicted = self._model.rollout(self._windows, self._steps, batch)
             errors = self._windows.errors(predicted, self._counted)
-            parts.append(errors / self._scale)
-        residuals = np.concatenate(parts)
+            batches.append(errors / self._scale)
+        residuals = np.concatenate(batches)
         return np.nan_to_num(
             residuals, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED
         )
@@ -266,7 +269,7 @@ def mean_logarithm(errors: Array, at_rest: Array) -> Array:
         errors: Mean distances (..., steps, groups).
         at_rest: From ``distances_at_rest`` (steps, groups).
     """
-    return np.log(np.maximum(errors / at_rest, _EXACT)).mean(axis=(-2, -1))
+    return np.log(np.maximum(errors / at_rest, _EXACT_SHARE)).mean(axis=(-2, -1))
 
 
 def _standard_errors(J: Array, residuals: Array, block: int) -> Array:

@@ -37,7 +37,11 @@ _COUNTS = {2: "two", 4: "four"}
 
 
 class Fold(NamedTuple):
-    """A split of a log into runs that models are fitted to, and held-out runs."""
+    """A split of a log into runs that models are fitted to, and held-out runs.
+
+    Held-out blocks begin with the past of their first prediction, which may be rows
+    that models are fitted to.
+    """
 
     train: Log
     held_out: Log
@@ -48,7 +52,7 @@ class Folds:
     """Folds of a log, each of which is fitted to what the others hold out."""
 
     parts: tuple[Fold, ...]  #: two or more
-    words: str  #: how the log was split
+    method: str  #: how the log was split, in words
     #: share of held-out rows inside the range of the rows that models are fitted to,
     #: or beyond it by 2 % of it at most, for the fold and the state or input that are
     #: covered worst
@@ -58,7 +62,7 @@ class Folds:
     def sentence(self) -> str:
         """How the log was split and how well that covers it, in a line."""
         return (
-            f"{self.words}; of every state and input at least {self.coverage:.0%} of "
+            f"{self.method}; of every state and input at least {self.coverage:.0%} of "
             "the held-out values lie inside the range fitted to"
         )
 
@@ -128,8 +132,8 @@ def _deals_of_runs(log: Log, folds: int, past: int, steps: int) -> list[Folds]:
             tuple(run for other in held_out if other is not own for run in other)
             for own in held_out
         ]
-        words = f"{count} runs, dealt to {_COUNTS[folds]} folds"
-        dealt = _folds(log, held_out, train, words)
+        method = f"{count} runs, dealt to {_COUNTS[folds]} folds"
+        dealt = _folds(log, held_out, train, method)
         if _is_usable(dealt, past, steps):
             splits.append(dealt)
     return sorted(splits, key=lambda folds: -folds.coverage)[:1]
@@ -154,7 +158,10 @@ def _blocks(log: Log, folds: int, count: int, past: int, steps: int) -> Folds | 
     window = past + steps
     length = len(log) / count
     between = int((folds - 1) * length)  # rows between two blocks of a fold
-    gap = min(window, int(length / _GAP_SHARE), (between - window - 1) // 2)
+    without_overlap = window  # no row of a held-out window is trained on
+    affordable = int(length / _GAP_SHARE)
+    leaves_a_window = (between - window - 1) // 2  # with a gap on both sides of it
+    gap = min(without_overlap, affordable, leaves_a_window)
     if gap < 0:
         return None
     blocks = _blocks_of_runs(log, folds, length, past)
@@ -168,12 +175,12 @@ def _blocks(log: Log, folds: int, count: int, past: int, steps: int) -> Folds | 
         train.append(tuple(_between(log, own, gap)))
     if not all(train):
         return None
-    words = (
+    method = (
         f"{len(blocks)} blocks of {length * log.time_step:.3g} s that take turns in "
         f"{_COUNTS[folds]} folds, {gap * log.time_step:.3g} s left out of the training "
         "rows at their ends"
     )
-    split = _folds(log, held_out, train, words)
+    split = _folds(log, held_out, train, method)
     return split if _is_usable(split, past, steps) else None
 
 
@@ -245,7 +252,7 @@ def _halves(log: Log, past: int) -> Folds:
         log,
         held_out=[first.runs, tuple(with_past)],
         train=[second.runs, first.runs],
-        words="two halves by time: the log is too short for more",
+        method="two halves by time: the log is too short for more",
     )
 
 
@@ -253,7 +260,7 @@ def _folds(
     log: Log,
     held_out: Sequence[tuple[LogRun, ...]],
     train: Sequence[tuple[LogRun, ...]],
-    words: str,
+    method: str,
 ) -> Folds:
     """Returns folds of runs.
 
@@ -261,16 +268,16 @@ def _folds(
         log: That the runs are of.
         held_out: Runs that each fold holds out.
         train: Runs that its models are fitted to, likewise.
-        words: How the log was split.
+        method: How the log was split, in words.
     """
-    parts = tuple(
+    folds = tuple(
         Fold(
             train=replace(log, runs=train_runs),
             held_out=replace(log, runs=held_out_runs),
         )
         for held_out_runs, train_runs in zip(held_out, train, strict=True)
     )
-    return Folds(parts, words, min(_coverage(fold) for fold in parts))
+    return Folds(folds, method, min(_coverage(fold) for fold in folds))
 
 
 def _is_usable(folds: Folds, past: int, steps: int) -> bool:

@@ -19,8 +19,8 @@ from gpmpc.models._windows import Windows
 _LONGEST = 300  # rows of a simulation
 _LEAST = 1.3  # times as long as the rollouts that decide, or it says nothing new
 _SIMULATIONS = 12  # of all folds, about
-_WORST = 2.0  # error that counts, over the spread
-_EXACT = 1e-4  # of the spread: what is smaller counts as exact
+_LARGEST_ERROR = 2.0  # that counts, over the spread
+_EXACT_SHARE = 1e-4  # of the spread: what is smaller counts as exact
 
 
 @dataclass(frozen=True)
@@ -33,27 +33,27 @@ class FreeSimulation:
 
     @classmethod
     def of(
-        cls, folds: Sequence[Fold], past: int, steps: int
+        cls, folds: Sequence[Fold], past_rows: int, steps: int
     ) -> "FreeSimulation | None":
         """Cuts windows; returns None where pieces are short, or states have angles.
 
         Args:
             folds: Of the log.
-            past: Rows before each start.
+            past_rows: Before each start.
             steps: Of the rollouts that decide.
         """
         lengths = [
             max(end - begin for run in fold.held_out for begin, end in run.pieces)
             for fold in folds
         ]
-        ahead = min(min(lengths) - past - 2, _LONGEST)
+        ahead = min(min(lengths) - past_rows - 2, _LONGEST)
         space = folds[0].held_out.space
         are_vectors = all(group.kind == "vector" for group in space.groups)
         if ahead < _LEAST * steps or not are_vectors:
             return None
         most = max(_SIMULATIONS // len(folds), 1)
         windows = tuple(
-            fold.held_out.windows(ahead, past=past, most=most) for fold in folds
+            fold.held_out.windows(ahead, past=past_rows, most=most) for fold in folds
         )
         rows = np.concatenate([run.states for fold in folds for run in fold.held_out])
         deviations = space.distances((rows - rows.mean(axis=0))[:, None])[:, 0]
@@ -65,7 +65,7 @@ class FreeSimulation:
     @property
     def worst_logarithms(self) -> Array:
         """Those (g,) of the worst models."""
-        return np.full(len(self.spread), np.log(_WORST))
+        return np.full(len(self.spread), np.log(_LARGEST_ERROR))
 
     def logarithms(self, models: Sequence[LogModel]) -> Array:
         """Computes the logarithms (g,) of root mean squared errors over the spread.
@@ -77,7 +77,7 @@ class FreeSimulation:
         for model, windows in zip(models, self.windows, strict=True):
             distances = windows.space.distances(model.rollout_errors(windows))
             # One that diverges is no worse than bad.
-            worst = _WORST * self.spread
+            worst = _LARGEST_ERROR * self.spread
             squares.append(np.square(np.minimum(distances, worst)).mean(axis=(0, 1)))
         error = np.sqrt(np.mean(squares, axis=0))
-        return np.log(np.maximum(error / self.spread, _EXACT))
+        return np.log(np.maximum(error / self.spread, _EXACT_SHARE))

@@ -19,7 +19,7 @@ from gpmpc.models._log_model import LogModel
 
 _JUDGED = (1, 10, 50)  # steps whose errors decide
 _WINDOWS = 400  # that structures are compared on
-_EXACT = 1e-4  # of a constant state's error: what is smaller counts as exact
+_EXACT_SHARE = 1e-4  # of a constant state's error: what is smaller counts as exact
 _ROUNDING = 1e-12  # of a state's range: likewise, where a constant state is exact
 
 
@@ -30,7 +30,7 @@ class HeldOutErrors:
         log: All runs.
         folds: Of the log.
         kinematics: Of all models.
-        past: Rows before the start of each.
+        past_rows: Before the start of each.
         steps: Of the rollouts.
     """
 
@@ -39,7 +39,7 @@ class HeldOutErrors:
         log: Log,
         folds: Sequence[Fold],
         kinematics: Kinematics,
-        past: int,
+        past_rows: int,
         steps: int,
     ):
         self._space = log.space
@@ -49,14 +49,15 @@ class HeldOutErrors:
         self.judged_steps = tuple(sorted({min(step, steps) for step in _JUDGED}))
         #: of each fold
         self.windows = [
-            fold.held_out.windows(steps, past=past, most=_WINDOWS // len(folds))
+            fold.held_out.windows(steps, past=past_rows, most=_WINDOWS // len(folds))
             for fold in folds
         ]
         self._baselines = self._baseline_distances(kinematics)
         still = self._baselines[CONSTANT_STATE].mean(axis=0)
         states = np.concatenate([run.states for run in log])
         sizes = log.space.distances(state_widths(log.space, states))
-        self._exact = _EXACT * still + _ROUNDING * sizes
+        # Errors that are smaller count as these (judged steps, groups).
+        self._exact_errors = _EXACT_SHARE * still + _ROUNDING * sizes
         self._scale = self._best_baseline_errors()
 
     def mean(self, models: Sequence[LogModel]) -> Array:
@@ -73,7 +74,7 @@ class HeldOutErrors:
         Args:
             errors: (judged steps, groups).
         """
-        return np.log(np.maximum(errors, self._exact) / self._scale)
+        return np.log(np.maximum(errors, self._exact_errors) / self._scale)
 
     def compare(
         self,
@@ -135,4 +136,4 @@ class HeldOutErrors:
     def _best_baseline_errors(self) -> Array:
         """Computes the errors (judged steps, groups) of the best baselines."""
         means = [distances.mean(axis=0) for distances in self._baselines.values()]
-        return np.maximum(np.min(means, axis=0), self._exact)
+        return np.maximum(np.min(means, axis=0), self._exact_errors)

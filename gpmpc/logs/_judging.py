@@ -40,7 +40,7 @@ LEVEL = 0.95
 MOST_OTHER_STEP = 0.05  # of a time step, by which a log's may differ by rounding
 MODEL = "model"  # name of the judged model among the predictors
 _WINDOWS = 1000
-_EXACT = 1e-9  # of a constant state's error
+_ROUNDING_SHARE = 1e-9  # of a constant state's error: an error by rounding
 _LINEARIZED = 100  # windows linearised at once
 
 
@@ -162,7 +162,7 @@ def judge(
         _check_signals(name, log, learned)
     model = learned.model
     space = held_out.space
-    windows = held_out.windows(max(steps), max(model.past, PAST), most=_WINDOWS)
+    windows = held_out.windows(max(steps), _past_rows(learned), most=_WINDOWS)
     model_errors = model.rollout_errors(windows, steps)
     errors = {MODEL: model_errors}
     errors |= baseline_errors(model.kinematics, train, windows, steps)
@@ -228,8 +228,8 @@ def most_steps(learned: IdentifiedModel, held_out: Log, train: Log) -> int:
     baselines beside it are fitted to as many steps of the rows that it was learned
     from.
     """
-    past = max(learned.model.past, PAST)
-    judged = held_out.longest_piece - past - 1
+    # A window has the past, the start and the steps.
+    judged = held_out.longest_piece - _past_rows(learned) - 1
     fitted = train.longest_piece - PAST - 1
     return min(judged, fitted)
 
@@ -239,16 +239,21 @@ def most_told_steps(learned: IdentifiedModel, held_out: Log) -> int:
 
     So many that four predictions do not overlap; less than one for none.
     """
-    past = max(learned.model.past, PAST)
-    rows = [b - a - past for run in held_out for a, b in run.pieces]
+    longest_past = _past_rows(learned)
+    rows = [end - begin - longest_past for run in held_out for begin, end in run.pieces]
     steps = 0
     while _starts(rows, steps + 1) >= FEWEST_PREDICTIONS * (steps + 1):
         steps += 1
     return steps
 
 
+def _past_rows(learned: IdentifiedModel) -> int:
+    """Returns the rows before a start that a model and the baselines look back on."""
+    return max(learned.model.past, PAST)
+
+
 def _starts(rows: Sequence[int], steps: int) -> int:
-    """Counts the starts of predictions in pieces of so many rows behind the past."""
+    """Counts the starts of predictions in pieces of so many rows after the past."""
     return sum(max(length - steps, 0) for length in rows)
 
 
@@ -256,11 +261,11 @@ def check_learned(learned: IdentifiedModel, held_out: Log, train: Log) -> None:
     """Raises ``DataError`` of a log that is too short to judge a model on."""
     if most_steps(learned, held_out, train) >= 1:
         return
-    past = max(learned.model.past, PAST)
+    looks_back = _past_rows(learned)
     names = ", ".join(run.name for run in held_out)
     raise DataError(
-        f"{names}: the model looks back on {past} rows, so judging it needs {past + 2} "
-        f"rows without a gap; the longest piece that is held out has "
+        f"{names}: the model looks back on {looks_back} rows, so judging it needs "
+        f"{looks_back + 2} rows without a gap; the longest piece that is held out has "
         f"{held_out.longest_piece}: hold out longer runs"
     )
 
@@ -328,7 +333,7 @@ def _comparisons(
 
     What is exact but for rounding is as good as anything that is.
     """
-    rounding = _EXACT * distances[CONSTANT_STATE].mean(axis=0)
+    rounding = _ROUNDING_SHARE * distances[CONSTANT_STATE].mean(axis=0)
     block = 2 * -(-windows.ahead // windows.stride)
     return tuple(
         compare(
@@ -347,12 +352,12 @@ def _comparisons(
 def _claimed_variances(
     learned: IdentifiedModel, windows: Windows, steps: Sequence[int]
 ) -> Array:
-    """Computes the variances (W, steps, e) that a model claims, part by part."""
-    parts = []
+    """Computes the variances (W, steps, e) that a model claims, batch by batch."""
+    variances = []
     for first in range(0, len(windows), _LINEARIZED):
-        part = windows[first : first + _LINEARIZED]
-        parts.append(error_variances(learned.model, part, learned.noise, steps))
-    return np.concatenate(parts)
+        batch = windows[first : first + _LINEARIZED]
+        variances.append(error_variances(learned.model, batch, learned.noise, steps))
+    return np.concatenate(variances)
 
 
 def _group_means(space: StateSpace, values: Array) -> Array:

@@ -26,7 +26,12 @@ from gpmpc.logs._folds import MANY_RUNS, Folds, split_folds
 from gpmpc.logs._log import Log
 from gpmpc.logs._ranges import ranges_of
 from gpmpc.logs._search import Search
-from gpmpc.logs._structures import Candidate, most_reach, past_rows, rows_late
+from gpmpc.logs._structures import (
+    Candidate,
+    affordable_rows_back,
+    likely_delay_rows,
+    past_rows_needed,
+)
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._namings import NO_NAMINGS, Namings
@@ -122,13 +127,13 @@ def learn(
     search = Search(
         log=log,
         folds=plan.folds.parts,
-        reach=plan.reach,
-        late=plan.late,
+        most_rows_back=plan.most_rows_back,
+        delay_rows=plan.delay_rows,
         points=points,
         steps=plan.steps,
         seed=seed,
         progress=progress,
-        memory=memory,
+        results=memory,
         for_control=for_control,
     )
     search.run()
@@ -162,7 +167,7 @@ def fewest_rows(runs: int) -> int:
 
     They are those of windows of two steps; a run is halved where there are few.
     """
-    window = past_rows(0) + _FEWEST_STEPS + 1
+    window = past_rows_needed(0) + _FEWEST_STEPS + 1
     return window if runs >= MANY_RUNS else 2 * window
 
 
@@ -170,8 +175,8 @@ class _Plan(NamedTuple):
     """How a log is split to compare structures, and what these may be."""
 
     folds: Folds
-    reach: int  # most rows that a structure may look back on
-    late: int  # rows by which inputs are likely to act late
+    most_rows_back: int  # that a structure may look back on
+    delay_rows: int  # by which inputs are likely to act late
     steps: int  # of the rollouts
 
 
@@ -183,30 +188,30 @@ def _plan_folds(log: Log, steps: int, for_control: bool) -> _Plan:
     Raises:
         DataError: No piece of the log is long enough.
     """
-    reach = most_reach(log, for_control)
+    most_rows_back = affordable_rows_back(log, for_control)
     has_few_parameters = for_control or log.mapping.model != "none"
     most_folds = 2 if has_few_parameters else 4
     while True:
-        late = rows_late(log, reach)
-        past = past_rows(reach, late)
-        fewer = min(steps, _most_steps(log, past))
+        delay_rows = likely_delay_rows(log, most_rows_back)
+        past_rows = past_rows_needed(most_rows_back, delay_rows)
+        fewer = min(steps, _most_steps(log, past_rows))
         while fewer >= _FEWEST_STEPS:
             try:
-                folds = split_folds(log, past, fewer, most=most_folds)
-                return _Plan(folds, reach, late, fewer)
+                folds = split_folds(log, past_rows, fewer, most=most_folds)
+                return _Plan(folds, most_rows_back, delay_rows, fewer)
             except DataError:
                 fewer -= max(fewer // 8, 1)
-        if reach == 0:
+        if most_rows_back == 0:
             runs = len(log.runs)
             raise DataError(
                 f"learning needs {fewest_rows(runs)} rows without a gap in "
                 f"{'two runs' if runs >= MANY_RUNS else 'a run'}; the longest piece "
                 f"has {log.longest_piece}"
             )
-        reach = 0
+        most_rows_back = 0
 
 
-def _most_steps(log: Log, past: int) -> int:
+def _most_steps(log: Log, past_rows: int) -> int:
     """Returns the most steps of which a fold of a log may have windows.
 
     A window has the past, the start and the steps.
@@ -214,7 +219,7 @@ def _most_steps(log: Log, past: int) -> int:
     longest = log.longest_piece
     if len(log.runs) < MANY_RUNS:
         longest //= 2  # runs are halved where nothing else is possible
-    return longest - past - 1
+    return longest - past_rows - 1
 
 
 def _identify(

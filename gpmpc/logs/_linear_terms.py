@@ -144,8 +144,10 @@ class _RolloutErrors:
         counted = np.geomspace(1, steps, _COUNTED_STEPS).round().astype(int)
         counted = np.unique(counted)
         deviation = _moments(model, log).deviation
-        moved = np.where(np.isfinite(deviation), model.weights * deviation, 0.0)
-        size = np.linalg.norm(moved, axis=1, keepdims=True)
+        # A regressor that never changes has an infinite deviation: its unit is zero, so
+        # that its weight is not moved.
+        effects = np.where(np.isfinite(deviation), model.weights * deviation, 0.0)
+        size = np.linalg.norm(effects, axis=1, keepdims=True)
         return cls(
             model=model,
             windows=windows,
@@ -273,11 +275,10 @@ def _moments(model: LogModel, log: Log) -> Moments:
 def _as_window(log: Log, run: LogRun, begin: int, end: int) -> Windows:
     """Returns a piece of a run as one window, whose start is its last row but one."""
     rows = slice(begin, end)
-    past = end - begin - 2
     return Windows(
         space=log.space,
         time_step=log.time_step,
-        past=past,
+        past=end - begin - 2,
         stride=1,
         states=run.states[None, rows],
         inputs=run.inputs[None, rows],
@@ -291,9 +292,9 @@ def _piece_data(model: LogModel, piece: Windows, stride: int) -> tuple[Array, Ar
     """Returns the regressors (N, r) and targets (N, o) of every so many rows."""
     rows = slice(model.lag, piece.past + 1)
     features, residuals = model.nominal_residuals(piece, rows)
-    reach = model.past - model.lag
-    starts = np.arange(reach, len(features[0]), stride)
-    earlier = starts[:, None] + np.arange(-reach, 0)
+    rows_back = model.past - model.lag  # of what acts; the delay is in ``features``
+    starts = np.arange(rows_back, len(features[0]), stride)
+    earlier = starts[:, None] + np.arange(-rows_back, 0)
     remembered = model.memory.begin(features[0][earlier], residuals[0][earlier])
     regressors = model.memory.regressors(features[0][starts], remembered)
     return regressors, residuals[0][starts]
@@ -304,21 +305,21 @@ def regression_data(model: LogModel, windows: Windows) -> tuple[Array, Array]:
 
     The targets are what the nominal part leaves of the outputs one step ahead.
     """
-    past = windows.past
-    states = windows.states[:, past]
-    context = windows.context[:, past]
-    acting, _ = model.acting_inputs(windows, slice(past, past + 1))
+    start = windows.past
+    states = windows.states[:, start]
+    context = windows.context[:, start]
+    acting, _ = model.acting_inputs(windows, slice(start, start + 1))
     inputs = acting[:, 0]
     m = windows.inputs.shape[-1]
     remembered = model.parts(model.recall(windows), m).memory
     features = model.features(states, inputs, context)
-    next_states = windows.states[:, past + 1]
+    next_states = windows.states[:, start + 1]
     measured = model.kinematics.outputs(states, next_states, windows.time_step)
     residuals = measured - model.nominal_outputs(states, inputs, context)
     return model.memory.regressors(features, remembered), residuals
 
 
-def _halves(log: Log, past: int) -> list[tuple[Log, Log]]:
+def _halves(log: Log, past_rows: int) -> list[tuple[Log, Log]]:
     """Splits a log in two halves, each of which is left out once.
 
     By run where there are enough runs, else by blocks of time that alternate. What a
@@ -326,12 +327,12 @@ def _halves(log: Log, past: int) -> list[tuple[Log, Log]]:
     """
     runs: Sequence[LogRun] = sorted(log.runs, key=len)
     if len(runs) < _FEW_RUNS:
-        runs = [block for run in log.runs for block in _blocks(run, past)]
+        runs = [block for run in log.runs for block in _blocks(run, past_rows)]
     halves = [replace(log, runs=tuple(runs[i::2])) for i in range(2)]
     return [(halves[0], halves[1]), (halves[1], halves[0])]
 
 
-def _blocks(run: LogRun, past: int) -> list[LogRun]:
+def _blocks(run: LogRun, past_rows: int) -> list[LogRun]:
     """Cuts a run into blocks of time of equal lengths, with the rows before them."""
     ends = np.linspace(0, len(run), _BLOCKS + 1).astype(int).tolist()
-    return [run.part(max(a - past, 0), b, f"block {a}") for a, b in pairwise(ends)]
+    return [run.part(max(a - past_rows, 0), b, f"block {a}") for a, b in pairwise(ends)]

@@ -32,10 +32,10 @@ _LINEARIZED = 400  # of all folds, along which rollouts are linearised: these ar
 _LINEARIZED_WITH_MEMORY = 120  # likewise of models with many entries to carry on
 _STRIDE_WITH_MEMORY = 8  # of the windows that are linearised of these
 _DIFFERENCE_OF_OUTPUTS = 1e-4  # of their ranges: in them a step is linear
-_MOST = 9.0  # of the mean squared error: variance that is claimed at most
+_LARGEST_CLAIM = 9.0  # of the mean squared error: the variance claimed at most
 _LEAST_FREEDOM = 4.0  # independent errors that a variance is supposed to be of
 _CUTS = 8  # rounds in which what is cut off is made up for
-_NOTHING = 1e-300  # least variance that anything is divided by
+_SMALLEST_VARIANCE = 1e-300  # that anything is divided by
 #: time constant with which the weight of an earlier error decays, in multiples of the
 #: time of the longest prediction
 _FORGETTING = 6.0
@@ -96,14 +96,15 @@ def follow_errors(
         times = windows.times[rows]
         spacing = float(times[-1] - times[0]) / max(len(rows) - 1, 1)
         for k, step in enumerate(steps):
-            prior = max(_PRIOR * step, _LEAST_PRIOR) * windows.time_step
+            prior_time = max(_PRIOR * step, _LEAST_PRIOR) * windows.time_step  # [s]
             # A prediction that is just over has the age of half a step.
             age = times[:, None] - times - (step - 0.5) * windows.time_step
             decay = np.exp(-np.maximum(age, 0) / (_FORGETTING * longest))
-            weights = np.where(age > 0, spacing * decay, 0.0)
-            deviations = np.sqrt(np.maximum(variances[rows, k], _NOTHING))
-            actual = prior * deviations + weights @ (errors[rows, k] ** 2 / deviations)
-            scaled[rows, k] *= actual / (prior * deviations + weights @ deviations)
+            weights = np.where(age > 0, spacing * decay, 0.0)  # [s]
+            deviations = np.sqrt(np.maximum(variances[rows, k], _SMALLEST_VARIANCE))
+            prior = prior_time * deviations
+            actual = prior + weights @ (errors[rows, k] ** 2 / deviations)
+            scaled[rows, k] *= actual / (prior + weights @ deviations)
     return scaled
 
 
@@ -146,25 +147,28 @@ def fit_noise(
     by_window = np.concatenate([fold.responses for fold in folds])
     responses = by_window.mean(axis=0)
     residuals = np.concatenate([fold.squared_residuals for fold in folds]).mean(axis=0)
-    relative = responses / np.maximum(squared, 1e-300)[..., None]
-    relative = relative.reshape(-1, responses.shape[-1])
-    finite = np.where(np.isfinite(relative), relative, 0.0)
-    factor = np.maximum(finite.max(axis=0), _NOTHING)
-    sharing = _sharing_rows(models[0], factor, residuals)
-    regressors = np.vstack([relative / factor, sharing])
-    targets = np.r_[np.ones(len(relative)), np.zeros(len(sharing))]
-    variances = _nonnegative_solution(regressors, targets) / factor
+    # Of each error, by a unit variance of each source (steps e, sources).
+    shares = responses / np.maximum(squared, _SMALLEST_VARIANCE)[..., None]
+    shares = shares.reshape(-1, responses.shape[-1])
+    finite = np.where(np.isfinite(shares), shares, 0.0)
+    # Each source is scaled so that its largest share of an error is one.
+    largest_share = np.maximum(finite.max(axis=0), _SMALLEST_VARIANCE)
+    sharing = _sharing_rows(models[0], largest_share, residuals)
+    regressors = np.vstack([shares / largest_share, sharing])
+    targets = np.r_[np.ones(len(shares)), np.zeros(len(sharing))]
+    variances = _nonnegative_solution(regressors, targets) / largest_share
     output_sources = len(TIME_CONSTANTS) * len(residuals)
-    rows = sum(len(log) for log in logs)
-    largest = np.maximum(_MOST * squared, _NOTHING)
+    largest = np.maximum(_LARGEST_CLAIM * squared, _SMALLEST_VARIANCE)
     kinematics = models[0].kinematics
-    return OutputNoise(
+    noise = OutputNoise(
         outputs=variances[:output_sources].reshape(len(TIME_CONSTANTS), -1),
         measurement=variances[output_sources:],
         steps=tuple(steps),
         scales=_scales(kinematics, squared, by_window @ variances, largest),
         largest=largest,
-    ).scaled(_student(rows, steps)[:, None])
+    )
+    rows = sum(len(log) for log in logs)
+    return noise.scaled(_student_factors(rows, steps)[:, None])
 
 
 def _nonnegative_solution(regressors: Array, targets: Array) -> Array:
@@ -181,7 +185,7 @@ def _nonnegative_solution(regressors: Array, targets: Array) -> Array:
         return np.maximum(lsq_linear(regressors, targets, (0, np.inf)).x, 0.0)
 
 
-def _student(rows: int, steps: Sequence[int]) -> Array:
+def _student_factors(rows: int, steps: Sequence[int]) -> Array:
     """Returns factors (steps,) of variances that few independent errors estimate.
 
     They are those of Student's t distribution, whose degrees of freedom are the
@@ -215,8 +219,9 @@ def learning_gains(
     """
     ratios = []
     for few, model, log in zip(fewer, models, logs, strict=True):
-        past = max(few.past, model.past, PAST)
-        windows = log.windows(max(steps), past=past, most=_COMPARED)
+        windows = log.windows(
+            max(steps), past=max(few.past, model.past, PAST), most=_COMPARED
+        )
         squared = [
             np.square(one.rollout_errors(windows, steps)).mean(axis=0)
             for one in (few, model)
@@ -224,7 +229,7 @@ def learning_gains(
         ratios.append(np.log(_group_ratios(model.kinematics, squared[1], squared[0])))
     gain = np.minimum(np.mean(ratios, axis=0), 0.0)
     variance = np.var(ratios, axis=0, ddof=1) / len(ratios)
-    agreement = gain**2 / np.maximum(gain**2 + variance, _NOTHING)
+    agreement = gain**2 / np.maximum(gain**2 + variance, _SMALLEST_VARIANCE)
     return np.exp(exponent * agreement * gain)
 
 
@@ -256,7 +261,9 @@ def _group_ratios(kinematics: Kinematics, squared: Array, claimed: Array) -> Arr
         actual = squared[:, columns].sum(axis=1, keepdims=True)
         total = claimed[:, columns].sum(axis=1, keepdims=True)
         ratios[:, columns] = np.where(
-            np.minimum(actual, total) > 0, actual / np.maximum(total, _NOTHING), 1.0
+            np.minimum(actual, total) > 0,
+            actual / np.maximum(total, _SMALLEST_VARIANCE),
+            1.0,
         )
     return ratios
 
@@ -283,14 +290,14 @@ def _fold_errors(
     )
 
 
-def _sharing_rows(model: LogModel, factor: Array, residuals: Array) -> Array:
+def _sharing_rows(model: LogModel, scales: Array, residuals: Array) -> Array:
     """Returns rows of least squares by which the outputs of a group share.
 
     They are zero where the variances of two outputs share as the residuals do.
 
     Args:
         model: Has the groups.
-        factor: Of each source's variance in the least squares (sources,).
+        scales: Of each source's variance in the least squares (sources,).
         residuals: Mean squared residuals of the outputs (o,).
     """
     rows = []
@@ -299,11 +306,12 @@ def _sharing_rows(model: LogModel, factor: Array, residuals: Array) -> Array:
         for group in model.kinematics.output_groups.values():
             for i, j in itertools.pairwise(group):
                 pair = [first_source + i, first_source + j]
-                scale = factor[pair] * np.maximum(residuals[[i, j]], 1e-300)
-                row = np.zeros(len(factor))
+                floored = np.maximum(residuals[[i, j]], _SMALLEST_VARIANCE)
+                scale = scales[pair] * floored
+                row = np.zeros(len(scales))
                 row[pair] = scale.min() / scale * [1.0, -1.0]
                 rows.append(row)
-    return np.array(rows).reshape(-1, len(factor))
+    return np.array(rows).reshape(-1, len(scales))
 
 
 def _responses(
@@ -379,11 +387,11 @@ def _difference_steps(
     """
     space = windows.space
     n = space.dim
-    past = windows.past
+    start = windows.past
     states = windows.states
     errors = space.difference(carried[:, :n], space.origin)
     outputs = model.kinematics.outputs(
-        states[:, past], states[:, past + 1], windows.time_step
+        states[:, start], states[:, start + 1], windows.time_step
     )
     return _DifferenceSteps(
         carried=difference_steps(np.hstack([errors, carried[:, n:]])),

@@ -13,7 +13,9 @@ them loses to the baseline.
 
 What is best is told stretch by stretch: a run, or a part of one where there are few. On
 each, errors are taken over those of what costs nothing, the ridge regression or a
-constant state, whichever is better *there*; and being behind counts twice. For the rows
+constant state, whichever is better *there*; and being behind counts twice. (These are
+the two of the baselines that are corrections as well; the other two are not among what
+is averaged.) For the rows
 to come may be like any of the stretches. A mean over all rows would be that of the
 wildest ones, and what loses at rest would be chosen.
 
@@ -37,21 +39,23 @@ _PARTS = 6  # of the held-out runs, each corrected by what the others say
 _KNOTS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # steps of a correction
 _PRIORS = tuple(
     Prior(penalty, movement)
-    for penalty in (np.inf, 10.0, 1.0, 0.1, 0.01, 0.001)
+    for penalty in (np.inf, 10.0, 1.0, 0.1, PENALTY, 0.001)
     for movement in (1.0, 0.5, 0.0)
 )
 _ROLLOUT = _PRIORS.index(Prior(np.inf, 1.0))  # as it is
 _RIDGE = _PRIORS.index(Prior(PENALTY, 0.0))  # the ridge regression without a model
 _STILL = _PRIORS.index(Prior(np.inf, 0.0))  # a constant state
-_NOTHING = 1e-300  # an error that is added, so that ratios of exact rollouts are one
+_FREE = (_RIDGE, _STILL)  # what costs nothing: the baselines that are corrections
+_SMALLEST_ERROR = 1e-300  # that is added, so that ratios of exact rollouts are one
 _MEMBERS = 8  # of an average, at most; one may be in it several times
-_HEDGES = (0.5, 0.375, 0.25, 0.125)  # shares of what costs nothing, to be tried
-_COST = 0.04  # of regret, that such a share may add
-_STRETCHES = 8  # of all runs, about
+_HEDGE_SHARES = (0.5, 0.375, 0.25, 0.125)  # of what costs nothing, to be tried
+_HEDGE_COST = 0.04  # regret that such a share may add
+_STRETCHES = 8  # of all runs, about; at least one of each
 _WINDOWS_OF_STRETCH = 2  # one after the other, that a stretch has rows for at least
-_EXACT = 1e-4  # of what costs nothing: an error that is smaller counts as exact
-_WORST = 4.0  # times what costs nothing: an error that is larger counts as this one
-_RESTING = 0.05  # of the stretches' median: least error that others are compared with
+# Of the error of what costs nothing: what is smaller, or larger, counts as this.
+_LEAST_RATIO = 1e-4
+_LARGEST_RATIO = 4.0
+_LEAST_OF_MEDIAN = 0.05  # of stretches: the least error that others are compared with
 
 
 @dataclass(frozen=True)
@@ -114,7 +118,8 @@ class Averages(NamedTuple):
     """Shares of corrections in their averages, and what is gained on other runs."""
 
     shares: Array  # of each prior (priors, judged steps, groups)
-    ratios: Array  # of mean errors with and without (judged steps, groups)
+    #: of mean errors over those of the rollout as it is (judged steps, groups)
+    ratios_to_rollout: Array
 
 
 def choose_averages(
@@ -144,8 +149,8 @@ def choose_averages(
             own = errors[:, :, k, columns]
             shares[:, k, g] = _choose_shares(own, _Regret(own, stretches))
             averaged = _mean_length(_average(shares[:, k, g], own))
-            without = _mean_length(own[_ROLLOUT])
-            ratios[k, g] = (averaged + _NOTHING) / (without + _NOTHING)
+            rolled_out = _mean_length(own[_ROLLOUT])
+            ratios[k, g] = (averaged + _SMALLEST_ERROR) / (rolled_out + _SMALLEST_ERROR)
     return Averages(shares, ratios)
 
 
@@ -189,26 +194,29 @@ def _fit_each(
         constant_states: By each step, for the priors that keep nothing of a rollout.
         steps: At which a regression stands.
     """
+    moving_priors = [prior for prior in _PRIORS if prior.movement]
+    still_priors = [prior for prior in _PRIORS if not prior.movement]
     with_movement = Correction.fit_each(
         kinematics=kinematics,
         windows=rollouts.windows,
         predicted=rollouts.predicted,
         steps=steps,
-        priors=[prior for prior in _PRIORS if prior.movement],
+        priors=moving_priors,
     )
-    without_movement = [
+    without_movement = [  # by step, then by prior
         Correction.fit_each(
             kinematics=kinematics,
             windows=constant_states[step].windows,
             predicted=constant_states[step].predicted,
             steps=(step,),
-            priors=[prior for prior in _PRIORS if not prior.movement],
+            priors=still_priors,
         )
         for step in steps
     ]
-    by_prior = [Correction.of_steps(one) for one in zip(*without_movement, strict=True)]
-    corrections = {True: iter(with_movement), False: iter(by_prior)}
-    return [next(corrections[prior.movement > 0]) for prior in _PRIORS]
+    by_prior = dict(zip(moving_priors, with_movement, strict=True))
+    for prior, *of_steps in zip(still_priors, *without_movement, strict=True):
+        by_prior[prior] = Correction.of_steps(of_steps)
+    return [by_prior[prior] for prior in _PRIORS]
 
 
 def _apart_from(own: Rollouts, rollouts: Rollouts) -> Rollouts:
@@ -221,17 +229,21 @@ def _apart_from(own: Rollouts, rollouts: Rollouts) -> Rollouts:
     windows = rollouts.windows
     if rollouts.rows is None or own.rows is None:
         return rollouts[~np.isin(windows.runs, own.windows.runs)]
-    own_rows = np.sort(own.rows)
-    following = np.searchsorted(own_rows, rollouts.rows)
-    next_row = own_rows[np.minimum(following, len(own_rows) - 1)]
-    last_row = own_rows[np.maximum(following - 1, 0)]
-    distances = np.minimum(
-        np.abs(rollouts.rows - next_row), np.abs(rollouts.rows - last_row)
-    )
+    distances = _distances_to_nearest(rollouts.rows, own.rows)
     are_apart = distances > own.windows.past + own.windows.ahead
     if not are_apart.any():
         are_apart = distances > 0
     return rollouts[are_apart]
+
+
+def _distances_to_nearest(rows: np.ndarray, own_rows: np.ndarray) -> np.ndarray:
+    """Computes how far rows (W,) are from the nearest one of some (V,)."""
+    own_rows = np.sort(own_rows)
+    insertions = np.searchsorted(own_rows, rows)
+    # Before the first own row, and after the last, the same one is on both sides.
+    after = own_rows[np.minimum(insertions, len(own_rows) - 1)]
+    before = own_rows[np.maximum(insertions - 1, 0)]
+    return np.minimum(np.abs(rows - after), np.abs(rows - before))
 
 
 def _choose_shares(errors: Array, regret: "_Regret") -> Array:
@@ -245,7 +257,8 @@ def _choose_shares(errors: Array, regret: "_Regret") -> Array:
     total = np.zeros(errors.shape[1:])
     least = np.inf
     for members in range(1, _MEMBERS + 1):
-        regrets = regret.means((total + errors) / members)
+        averages = (total + errors) / members  # with each as the next member (A, W, e)
+        regrets = regret.means(averages)
         best = regrets.argmin()
         if regrets[best] >= least:
             break
@@ -266,11 +279,11 @@ class _Regret:
 
     def __init__(self, errors: Array, stretches: np.ndarray):
         self._stretches = stretches
-        free = errors[[_RIDGE, _STILL]]
+        free = errors[list(_FREE)]
         least = self._mean_lengths(free).min(axis=0)
         # Where nothing moves a constant state is exact, and everything else infinitely
         # far behind it.
-        self._least = np.maximum(least, _RESTING * np.median(least))
+        self._least = np.maximum(least, _LEAST_OF_MEDIAN * np.median(least))
 
     def by_stretch(self, errors: Array) -> Array:
         """Computes the regrets (..., stretches) of errors (..., W, e).
@@ -278,8 +291,10 @@ class _Regret:
         They are logarithms of mean errors over those of what costs nothing; positive
         ones count twice, and no stretch counts more than one that is four times behind.
         """
-        ratios = (self._mean_lengths(errors) + _NOTHING) / (self._least + _NOTHING)
-        logarithms = np.log(np.clip(ratios, _EXACT, _WORST))
+        ratios = (self._mean_lengths(errors) + _SMALLEST_ERROR) / (
+            self._least + _SMALLEST_ERROR
+        )
+        logarithms = np.log(np.clip(ratios, _LEAST_RATIO, _LARGEST_RATIO))
         return logarithms + np.maximum(logarithms, 0.0)
 
     def means(self, errors: Array) -> Array:
@@ -296,23 +311,25 @@ class _Regret:
 def _stretches_of(windows: Windows) -> np.ndarray:
     """Returns the number of the stretch that each window is of (W,).
 
-    A run is one; where there are few runs, they are cut into as many as have rows for
-    some windows one after the other.
+    A run, or a block of one, is a stretch; where there are few, they are cut into as
+    many as have rows for some windows one after the other.
     """
     runs = np.unique(windows.runs, return_inverse=True)[1]
-    firsts = np.full(runs.max() + 1, np.inf)
-    np.minimum.at(firsts, runs, windows.times)
-    rows = (windows.times - firsts[runs]) / windows.time_step  # since its run began
-    lengths = np.zeros(len(firsts))
+    first_times = np.full(runs.max() + 1, np.inf)
+    np.minimum.at(first_times, runs, windows.times)
+    # Of each window, since the first one of its run (W,).
+    rows = (windows.times - first_times[runs]) / windows.time_step
+    lengths = np.zeros(len(first_times))  # of each run, in rows
     np.maximum.at(lengths, runs, rows)
     lengths += windows.ahead
-    wanted = np.round(_STRETCHES * lengths / lengths.sum())
-    most = lengths // (_WINDOWS_OF_STRETCH * windows.ahead)
-    counts = np.maximum(np.minimum(wanted, most), 1)
-    spans = np.maximum(lengths - windows.ahead + 1, 1)
-    parts = np.floor(rows * (counts / spans)[runs])
-    # A gap may leave one of them empty.
-    return np.unique(runs * (_STRETCHES + 1) + parts, return_inverse=True)[1]
+    proportional = np.round(_STRETCHES * lengths / lengths.sum())
+    affordable = lengths // (_WINDOWS_OF_STRETCH * windows.ahead)
+    stretches_per_run = np.maximum(np.minimum(proportional, affordable), 1)
+    starts_per_run = np.maximum(lengths - windows.ahead + 1, 1)
+    stretch_in_run = np.floor(rows * (stretches_per_run / starts_per_run)[runs])
+    numbers = runs * (_STRETCHES + 1) + stretch_in_run
+    # A gap may leave one of them empty: they are numbered anew.
+    return np.unique(numbers, return_inverse=True)[1]
 
 
 def _without_chance(shares: Array, errors: Array, regret: _Regret) -> Array:
@@ -327,7 +344,7 @@ def _without_chance(shares: Array, errors: Array, regret: _Regret) -> Array:
         errors: Of each correction (A, W, e).
         regret: Of errors.
     """
-    singles = np.array([_ROLLOUT, _RIDGE, _STILL])
+    singles = np.array([_ROLLOUT, *_FREE])
     single = singles[regret.means(errors[singles]).argmin()]
     of_single = regret.by_stretch(errors[single])
     gains = of_single - regret.by_stretch(_average(shares, errors))
@@ -335,10 +352,10 @@ def _without_chance(shares: Array, errors: Array, regret: _Regret) -> Array:
     if gain <= 0 or len(gains) < 2:  # of one stretch all may be chance
         return np.eye(len(shares))[single]
     variance = gains.var(ddof=1) / len(gains)
-    kept = gain**2 / (gain**2 + variance)
-    moved = kept * shares
-    moved[single] += 1 - kept
-    return moved
+    agreement = gain**2 / (gain**2 + variance)
+    shrunk = agreement * shares
+    shrunk[single] += 1 - agreement
+    return shrunk
 
 
 def _with_hedge(shares: Array, errors: Array, regret: _Regret) -> Array:
@@ -349,14 +366,14 @@ def _with_hedge(shares: Array, errors: Array, regret: _Regret) -> Array:
         errors: Of each (A, W, e).
         regret: Of errors.
     """
-    free = np.array([_RIDGE, _STILL])
+    free = np.array(_FREE)
     best = free[regret.means(errors[free]).argmin()]
-    most = regret.means(_average(shares, errors)) + _COST
-    for hedge in _HEDGES:
-        mixed = (1 - hedge) * shares
-        mixed[best] += hedge
-        if regret.means(_average(mixed, errors)) <= most:
-            return mixed
+    largest = regret.means(_average(shares, errors)) + _HEDGE_COST
+    for hedge in _HEDGE_SHARES:
+        hedged = (1 - hedge) * shares
+        hedged[best] += hedge
+        if regret.means(_average(hedged, errors)) <= largest:
+            return hedged
     return shares
 
 
@@ -404,5 +421,5 @@ def fit_correction(
 def _parts_of_whole_runs(windows: Windows) -> list[np.ndarray]:
     """Deals runs to parts; returns which windows are of each (W,)."""
     runs = np.unique(windows.runs)
-    parts = np.array_split(runs, min(_PARTS, len(runs)))
-    return [np.isin(windows.runs, part) for part in parts]
+    runs_of_parts = np.array_split(runs, min(_PARTS, len(runs)))
+    return [np.isin(windows.runs, own) for own in runs_of_parts]

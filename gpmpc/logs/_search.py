@@ -5,8 +5,11 @@
 2. Groups of outputs: those of one nominal structure, the others of another.
 3. GPs on the groups of outputs, from none and from all at once, by the change of one
    group at a time that helps most.
-4. A correction by the past upon the best structure, unless it costs more than little:
+4. GPs of past rows, on one group after the other.
+5. A correction by the past upon the best structure, unless it costs more than little:
    it hedges against runs that are unlike those of the log.
+
+Models for a controller end with the fourth.
 
 A structure's score is the mean, over groups and steps, of the logarithm of its error
 over that of the best baseline; where it is behind, that counts twice. A simulation of
@@ -36,24 +39,24 @@ from gpmpc.logs._structures import (
     Structure,
     additions,
     bases,
-    past_rows,
+    past_rows_needed,
 )
 from gpmpc.logs._validation import Validations
 from gpmpc.models._kinematics import RigidBodyKinematics
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._log_model import LogModel
-from gpmpc.models._parametric import AffineNominal
+from gpmpc.models._parametric import is_still
 
 _WINDOWS_OF_LAGS = 4  # that a log is to hold where inputs act through lags
 _AVERAGES = (1, 5, 10)  # rows over which the targets of a GP are averaged
 _PIECE = 0.02  # of the score that every piece of a structure has to earn
 _BEAM = 2  # structures that go on, of a round
 _CLOSE = 0.02  # of the best score: where the second one goes on as well
-_ROWS_SEEN = 8  # most past rows that a GP sees
-_NOTHING = 1e-9  # of the outputs: a residual that is none
+_MOST_ROWS_OF_GP = 8  # past rows that a GP sees
+_NO_RESIDUAL = 1e-9  # of the outputs: a residual up to this is round-off
 _OUT_OF_REACH = 0.5  # mean logarithm by which rollouts are too bad to be simulated
 _UNSTABLE = 10.0  # of the score of what grows without bounds outside of its data
-_HEDGE = 0.03  # of the score, that a correction may cost
+_CORRECTION_BONUS = 0.03  # of the score, that a correction may cost
 _LOSS = 2.0  # weight of being behind a baseline
 _ROUNDS = 8  # of changes of the GPs of one nominal structure, at most
 
@@ -64,44 +67,44 @@ class Search:
     Args:
         log: All runs.
         folds: Of the log.
-        reach: Most rows that a structure may look back on.
+        most_rows_back: That a structure may look back on.
         points: Rows that a GP is trained on.
         steps: Of the rollouts.
         seed: Of every random number.
         progress: Called with a line for each structure.
-        memory: By the key of a structure without GPs, the parameters of its nominal
+        results: By the key of a structure without GPs, the parameters of its nominal
             model by fold (lists of numbers), and by "penalties of" it those of its
             outputs; of any other, its errors. By "simulation of" a key, the logarithms
             of the errors of its simulations; by "averages of" one, the shares and
             errors of its corrections.
         for_control: Leaves out what no controller can plan with.
-        late: Rows by which inputs are likely to act late.
+        delay_rows: By which inputs are likely to act late.
     """
 
     def __init__(
         self,
         log: Log,
         folds: Sequence[Fold],
-        reach: int,
+        most_rows_back: int,
         points: int,
         steps: int,
         seed: int,
         progress: Any,
-        memory: MutableMapping[str, Any],
+        results: MutableMapping[str, Any],
         for_control: bool,
-        late: int = 0,
+        delay_rows: int = 0,
     ):
         self._log = log
         self._folds = folds
         self._steps = steps
         self._seed = seed
         self._progress = progress
-        self._memory = memory
+        self._results = results
         self._for_control = for_control
-        self._bases = bases(log, reach, late)
+        self._bases = bases(log, most_rows_back, delay_rows)
         kinematics = self._bases[0].model.kinematics
-        past = past_rows(reach, late)
-        self._held_out = HeldOutErrors(log, folds, kinematics, past, steps)
+        past_rows = past_rows_needed(most_rows_back, delay_rows)
+        self._held_out = HeldOutErrors(log, folds, kinematics, past_rows, steps)
         self.judged_steps = self._held_out.judged_steps
         self._fits = StructureFits(
             log=log,
@@ -110,18 +113,19 @@ class Search:
             points=points,
             steps=steps,
             seed=seed,
-            memory=memory,
+            results=results,
         )
         self._validations = Validations(
-            log, folds, self._fits, past, steps, self.judged_steps
+            log, folds, self._fits, past_rows, steps, self.judged_steps
         )
         self._structures: dict[str, Structure] = {}
         self._errors: dict[str, Array] = {}  # means, by the structure's key
         self._simulation: FreeSimulation | None = None
         if not for_control:
-            self._simulation = FreeSimulation.of(folds, past, steps)
+            self._simulation = FreeSimulation.of(folds, past_rows, steps)
         self._simulated: dict[str, Array] = {}
-        self._best_logarithm = np.inf  # mean of the errors of rollouts, over baselines
+        # Least mean logarithm of a structure's rollouts over those of baselines.
+        self._best_logarithm = np.inf
         self._unstable: set[str] = set()  # keys of nominal structures
 
     @property
@@ -152,18 +156,19 @@ class Search:
             self._search_gps(start)
         for start in self._starts_of_gps_of_past():
             self._search_gps_of_past(start)
-        if self._for_control:
+        if self._for_control:  # no correction, and no products that may be unstable
             return
         self._consider_correction(self.best)
-        # What is stable by half of the rows need not be so by all. This ends: what is
-        # marked falls behind, and a constant state is never unstable.
-        while self._mark_if_unstable_by_all_rows(self.best):
+        # What is stable by half of the rows need not be so by all.
+        while self._is_unstable_by_all_rows(self.best):
+            # It falls behind, so that this ends: a constant state is never unstable.
+            self._unstable.add(self.best.nominal.key)
             self._consider_correction(self.best)
 
     def score(self, structure: Structure) -> float:
         """Returns the score of a structure that was considered; smaller is better."""
-        hedge = _HEDGE if structure.shares else 0.0
-        return self._logarithm(structure) + _PIECE * structure.size - hedge
+        bonus = _CORRECTION_BONUS if structure.correction_shares else 0.0
+        return self._logarithm(structure) + _PIECE * structure.size - bonus
 
     def _logarithm(self, structure: Structure) -> float:
         """Computes the score without what a structure's pieces cost."""
@@ -224,8 +229,8 @@ class Search:
     def _has_rows(self, structure: Structure) -> bool:
         """Returns whether lags can be fitted, and judged on rows that were held out.
 
-        Every fold needs a piece as long as a window, and the log several of them: a
-        fifth of it may be all that it is judged on.
+        Every fold needs a piece as long as a window, and the log several of them:
+        ``gpmpc learn`` may judge the model on a quarter as many rows as these.
         """
         model = structure.model
         if not len(model.time_constants):
@@ -246,7 +251,8 @@ class Search:
     def _consider_nominal(self, structure: Structure, parent: Structure | None) -> None:
         """Considers a nominal structure, fitted from the parameters of another."""
         models = self._fits.fit_nominal(structure, parent)
-        self._mark_if_unstable(structure, models)
+        if self._is_unstable(models):
+            self._unstable.add(structure.nominal.key)
         self._measure(structure, models)
 
     # 2. combinations of groups of outputs
@@ -265,25 +271,30 @@ class Search:
     def _exchange_groups(self, first: Structure, other: Structure) -> None:
         """Takes groups of outputs from another structure while that helps."""
         groups = tuple(first.model.kinematics.output_groups)
-        theirs: tuple[str, ...] = ()
+        groups_of_other: tuple[str, ...] = ()
         best = first
-        while len(theirs) < len(groups) - 1:
-            tried = []
+        while len(groups_of_other) < len(groups) - 1:
+            combinations = []
             for group in groups:
-                if group in theirs:
+                if group in groups_of_other:
                     continue
-                taken = tuple(g for g in groups if g == group or g in theirs)
-                own = tuple(g for g in groups if g not in taken)
-                combined = self._consider_combination(((first, own), (other, taken)))
+                one_more = {*groups_of_other, group}
+                exchanged = tuple(name for name in groups if name in one_more)
+                own = tuple(name for name in groups if name not in one_more)
+                combined = self._consider_combination(
+                    ((first, own), (other, exchanged))
+                )
                 if combined is not None:
-                    tried.append((combined, taken))
-            if not tried:
+                    combinations.append((combined, exchanged))
+            if not combinations:
                 return
-            combined, taken = min(tried, key=lambda pair: self.score(pair[0]))
+            combined, exchanged = min(
+                combinations, key=lambda combination: self.score(combination[0])
+            )
             if self.score(combined) >= self.score(best):
                 return
             best = combined
-            theirs = taken
+            groups_of_other = exchanged
 
     def _consider_combination(
         self, parts: tuple[tuple[Structure, tuple[str, ...]], ...]
@@ -305,15 +316,16 @@ class Search:
         Upon a state that stays a GP is what ``gpmpc.gp.train`` makes of the rows.
         """
         ranked = self._ranked(self._structures.values())
-        # Of those without a memory, GPs see rows without noise.
-        plain = [one for one in ranked if one.model.memory.empty]
-        starts = [one for one in ranked[:1] if one.model.memory.products is None]
-        starts += [one for one in plain[:1] if one is not ranked[0]]
+        best = ranked[0]
+        # Products of past rows and GPs would explain the same.
+        starts = [best] if best.model.memory.products is None else []
+        # Those without a memory are fitted to smoothed rows, so their GPs are as well.
+        without_memory = [one for one in ranked if one.model.memory.empty]
+        starts += [one for one in without_memory[:1] if one is not best]
         keys = [start.key for start in starts]
         for base in self._bases:
-            nominal = base.model.nominal
-            is_still = isinstance(nominal, AffineNominal) and not nominal.fitted
-            if is_still and base.base == CONSTANT_STATE and base.key not in keys:
+            is_constant_state = base.base == CONSTANT_STATE
+            if is_constant_state and base.key not in keys:
                 starts.append(base)
         return starts
 
@@ -347,9 +359,9 @@ class Search:
         starts = []
         for structure in self._ranked(self._structures.values()):
             model = structure.model
-            seen = model.memory.copies
+            rows = model.memory.copies
             is_plain = not (structure.gps or structure.parts or model.memory.products)
-            if 0 < seen <= _ROWS_SEEN and is_plain:
+            if 0 < rows <= _MOST_ROWS_OF_GP and is_plain:
                 starts.append(structure)
         return starts[:_BEAM]
 
@@ -408,7 +420,7 @@ class Search:
         model = self._fits.models(structure.nominal)[0]
         measured, modelled = model.first_outputs(windows)
         residual = np.abs(measured - modelled).max(axis=0)
-        is_left = residual > _NOTHING * np.abs(measured).max(axis=0)
+        is_left = residual > _NO_RESIDUAL * np.abs(measured).max(axis=0)
         groups = model.kinematics.output_groups
         return tuple(name for name, own in groups.items() if is_left[list(own)].any())
 
@@ -437,13 +449,13 @@ class Search:
         if structure.key in self._structures:
             return
         key = f"simulation of {structure.key}"
-        if key not in self._memory:
+        if key not in self._results:
             models = self._fits.models(structure)
-            self._memory[structure.key] = self._held_out.mean(models).tolist()
-            errors = np.array(self._memory[structure.key])
-            self._memory[key] = self._simulate(models, errors).tolist()
-        errors = np.array(self._memory[structure.key])
-        self._enter_simulated(structure, errors, np.array(self._memory[key]))
+            self._results[structure.key] = self._held_out.mean(models).tolist()
+            errors = np.array(self._results[structure.key])
+            self._results[key] = self._simulate(models, errors).tolist()
+        errors = np.array(self._results[structure.key])
+        self._enter_simulated(structure, errors, np.array(self._results[key]))
 
     # 4. corrections by the past
 
@@ -453,56 +465,45 @@ class Search:
         A structure has none whose rollouts diverge on all that a model was not fitted
         to.
         """
-        if structure.shares:
+        if structure.correction_shares:
             return
         key = f"averages of {structure.key}"
-        if key not in self._memory:
+        if key not in self._results:
             averages = self._validations.choose_averages(structure)
             if averages is None:
                 return
-            errors = self._errors[structure.key] * averages.ratios
-            self._memory[key] = {
+            errors = self._errors[structure.key] * averages.ratios_to_rollout
+            self._results[key] = {
                 "shares": averages.shares.tolist(),
                 "errors": errors.tolist(),
             }
         shares = tuple(
             tuple(tuple(map(float, groups)) for groups in steps)
-            for steps in self._memory[key]["shares"]
+            for steps in self._results[key]["shares"]
         )
-        errors = np.array(self._memory[key]["errors"])
-        self._enter(replace(structure, shares=shares), errors)
+        errors = np.array(self._results[key]["errors"])
+        self._enter(replace(structure, correction_shares=shares), errors)
 
     # what all of them need
 
-    def _mark_if_unstable(
-        self, structure: Structure, models: Sequence[LogModel]
-    ) -> bool:
-        """Marks a structure if one of its models grows outside of its data.
-
-        Returns whether it is unstable.
-        """
+    def _is_unstable(self, models: Sequence[LogModel]) -> bool:
+        """Returns whether one of some models grows outside of its data."""
         inputs = len(self._log.input_names)
         time_step = self._log.time_step
-        is_unstable = any(grows_outside(model, inputs, time_step) for model in models)
-        if is_unstable:
-            self._unstable.add(structure.nominal.key)
-        return is_unstable
+        return any(grows_outside(model, inputs, time_step) for model in models)
 
-    def _mark_if_unstable_by_all_rows(self, structure: Structure) -> bool:
-        """Marks a structure if its model of all rows grows outside of its data.
-
-        Returns whether it is unstable.
-        """
+    def _is_unstable_by_all_rows(self, structure: Structure) -> bool:
+        """Returns whether the model of all rows grows outside of its data."""
         fit = self._fits.fit_to_all_runs(structure)
-        return self._mark_if_unstable(structure, [fit.model])
+        return self._is_unstable([fit.model])
 
     def _measure(self, structure: Structure, models: Sequence[LogModel]) -> None:
         """Enters a nominal structure with the errors of its models."""
         errors = self._held_out.mean(models)
         key = f"simulation of {structure.key}"
-        if key not in self._memory:
-            self._memory[key] = self._simulate(models, errors).tolist()
-        self._enter_simulated(structure, errors, np.array(self._memory[key]))
+        if key not in self._results:
+            self._results[key] = self._simulate(models, errors).tolist()
+        self._enter_simulated(structure, errors, np.array(self._results[key]))
 
     def _enter_simulated(
         self, structure: Structure, errors: Array, simulated: Array
@@ -522,7 +523,8 @@ class Search:
     def _simulate(self, models: Sequence[LogModel], errors: Array) -> Array:
         """Simulates long held-out rows; returns the logarithms of errors (g,), or none.
 
-        Of models whose rollouts are far from the best ones the worst is taken.
+        Models whose rollouts are far from the best ones are not simulated: they get the
+        worst errors that count.
         """
         if self._simulation is None:
             return np.empty(0)
@@ -545,8 +547,10 @@ class Search:
     def comparisons(self) -> tuple[Comparison, ...]:
         """Compares the best structure with the baselines, and with the second best."""
         ranked = self._ranked(self._structures.values())
-        second = {one.name: self._validations.models(one) for one in ranked[1:2]}
-        models = self._validations.models(ranked[0])
+        second = {
+            one.name: self._validations.corrected_models(one) for one in ranked[1:2]
+        }
+        models = self._validations.corrected_models(ranked[0])
         return self._held_out.compare(models, second, self._seed)
 
     def rivals(self) -> dict[str, LogModel]:
@@ -557,11 +561,11 @@ class Search:
         best = self.best
         rivals: dict[str, Structure] = {}
         for structure in self._ranked(self._structures.values()):
-            nominal = structure.model.nominal
-            is_still = isinstance(nominal, AffineNominal) and not nominal.fitted
-            if structure.base != best.base and not (is_still or structure.shares):
+            if structure.base == best.base or structure.correction_shares:
+                continue
+            if not is_still(structure.model.nominal):
                 rivals.setdefault(structure.base, structure)
-        return {one.name: self._validations.models(one)[0] for one in rivals.values()}
+        return {one.name: self._fits.models(one)[0] for one in rivals.values()}
 
     def fit_noise(self) -> OutputNoise:
         """Fits the noise of the best structure to held-out runs."""

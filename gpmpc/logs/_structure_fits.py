@@ -45,7 +45,7 @@ class StructureFits:
         points: Rows that a GP is trained on.
         steps: Of the rollouts.
         seed: Of every random number.
-        memory: By the key of a structure without GPs, the parameters of its nominal
+        results: By the key of a structure without GPs, the parameters of its nominal
             model by fold (lists of numbers); by "penalties of" a key, those of its
             outputs. What ``Search`` keeps there stays as it is.
     """
@@ -58,7 +58,7 @@ class StructureFits:
         points: int,
         steps: int,
         seed: int,
-        memory: MutableMapping[str, Any],
+        results: MutableMapping[str, Any],
     ):
         self._log = log
         self._folds = folds
@@ -66,7 +66,7 @@ class StructureFits:
         self._points = points
         self._steps = steps
         self._seed = seed
-        self._memory = memory
+        self._results = results
         self._nominal_models: dict[str, list[LogModel]] = {}
         self._gps: dict[tuple[str, GroupGP], list[OutputGP]] = {}
         self._fits: dict[str, NominalFit] = {}  # to all rows
@@ -77,10 +77,10 @@ class StructureFits:
         self, structure: Structure, parent: Structure | None
     ) -> list[LogModel]:
         """Fits a nominal structure on each fold, from the parameters of another."""
-        rows = self._training_of(structure)
-        if structure.key not in self._memory:
+        data = self._training_of(structure)
+        if structure.key not in self._results:
             starts = [structure.model] * len(self._folds)
-            if parent is not None:
+            if parent is not None:  # whose models were fitted on the same folds
                 starts = self._nominal_models[parent.key]
             fits = [
                 fit_from(
@@ -89,18 +89,18 @@ class StructureFits:
                     log=training.log,
                     steps=self._steps,
                     choose_penalties=self._penalties_of(structure),
-                    same_log=parent is not None,
+                    starts_on_same_log=parent is not None,
                 ).model
-                for start, training in zip(starts, rows, strict=True)
+                for start, training in zip(starts, data, strict=True)
             ]
-            self._memory[structure.key] = [model.parameters for model in fits]
+            self._results[structure.key] = [model.parameters for model in fits]
         models = [
             replace(
                 structure.model.with_parameters(parameters),
                 start_filter=training.start_filter,
             )
             for parameters, training in zip(
-                self._memory[structure.key], rows, strict=True
+                self._results[structure.key], data, strict=True
             )
         ]
         self._nominal_models[structure.key] = models
@@ -207,10 +207,10 @@ class StructureFits:
         key = f"penalties of {structure.key}"
 
         def choose(model: LogModel) -> Array:
-            if key not in self._memory:
+            if key not in self._results:
                 penalties = choose_penalties(model, self._log, self._steps)
-                self._memory[key] = penalties.tolist()
-            return np.array(self._memory[key])
+                self._results[key] = penalties.tolist()
+            return np.array(self._results[key])
 
         return choose
 

@@ -3,6 +3,25 @@
 A structure is a nominal model with its history and lag, grown by one addition after the
 other, and GPs on groups of outputs. ``bases`` lists those that a search begins with.
 
+Of past rows three numbers speak. ``rows_back`` are those that a memory, or an addition,
+looks back on. ``most_rows_back`` is their limit in a search, by the lengths of the
+log's pieces (``affordable_rows_back``). ``past_rows_needed`` are those that windows are
+cut with, so that any structure of the search has them: delays come upon that limit.
+
+What excludes what:
+
+=====================  ================================================================
+addition               none where there is
+=====================  ================================================================
+a memory               a memory, or a fitted affine part, which its linear term has
+products of rows       no memory of as many rows; lags, as products see past inputs
+a delay of inputs      a delay, a memory (it knows the past inputs), or a still state
+first-order lags       lags, products, no input, or a still state without a memory
+a disturbance          a memory, whose means of outputs take its place
+fitted on rollouts     no memory; a rigid body, whose weights are too many
+a group by past rows   no memory
+=====================  ================================================================
+
 A mapping may name any system (``nominal``), and vehicles stand in
 ``_system_structures``. To add a structure for another kind of system that is none:
 
@@ -29,16 +48,16 @@ from gpmpc.logs._input_delay import MOST_ROWS, likely_delay
 from gpmpc.logs._log import Log
 from gpmpc.logs._system_structures import system_nominal
 from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
-from gpmpc.models._log_model import LAG_ROWS, LogModel
+from gpmpc.models._log_model import LAG_FILL_ROWS, LogModel
 from gpmpc.models._memory import Memory, Products
-from gpmpc.models._parametric import AffineNominal, MultirotorNominal
+from gpmpc.models._parametric import AffineNominal, MultirotorNominal, is_still
 from gpmpc.models._system_nominal import SystemNominal
 
-LATE = 3  # rows by which motors may act late
+MOTOR_DELAY_ROWS = 3  # by which motors may act late
 # Rows over which the residuals before a start are averaged to a disturbance: all of the
 # past that windows are cut with.
 DISTURBANCE_ROWS = PAST
-#: what models may remember, by its key and in words
+#: what models may remember, by its key and with its label
 _MEMORIES = {
     "rows_and_means": (
         "3 past rows and means",
@@ -71,11 +90,11 @@ class Addition:
     """Something that a structure may have besides."""
 
     key: str  #: in the memory of a search
-    words: str  #: in the names of candidates
+    label: str  #: in the names of candidates
     #: adds it to a model; returns None where it makes no sense
     extend: Callable[[LogModel], LogModel | None]
     for_control: bool = True  #: whether a controller can plan with it
-    reach: int = 0  #: rows that it looks back on
+    rows_back: int = 0  #: that it looks back on
 
 
 class GroupGP(NamedTuple):
@@ -86,8 +105,8 @@ class GroupGP(NamedTuple):
     sees_past: bool = False  # whether it is a function of the past rows as well
 
     @property
-    def words(self) -> str:
-        """The GP in words."""
+    def label(self) -> str:
+        """The GP in the names of candidates."""
         if self.sees_past:
             return f"{self.group} (of past rows)"
         return f"{self.group} (averaged over {self.rows})"
@@ -95,8 +114,8 @@ class GroupGP(NamedTuple):
     @property
     def key(self) -> str:
         """The GP in the memory of a search."""
-        past = ":past" if self.sees_past else ""
-        return f"gp:{self.group}:{self.rows}{past}"
+        suffix = ":past" if self.sees_past else ""
+        return f"gp:{self.group}:{self.rows}{suffix}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,43 +123,45 @@ class Structure:
     """A form of a model, without the values of its parameters."""
 
     base: str  #: that it grew from, such as "rigid body"
-    model: LogModel  #: nominal part, history and lag
+    model: LogModel  #: its form: what the values of the parameters are does not matter
     inputs: int  #: number of inputs
-    reach: int  #: most rows that its additions may look back on
+    most_rows_back: int  #: that its additions may look back on
     #: smallest and largest features in the log (2, d); empty where no term needs them
     ranges: tuple[tuple[float, ...], ...] = ()
-    late: int = 0  #: rows by which the inputs are likely to act late
+    delay_rows: int = 0  #: by which the inputs are likely to act late
     additions: tuple[Addition, ...] = ()
     gps: tuple[GroupGP, ...] = ()
     #: structures without GPs, each with the groups of outputs that are its own; none of
     #: a structure that is not put together
     parts: tuple[tuple["Structure", tuple[str, ...]], ...] = ()
     #: of the corrections by the past whose average it has (priors, judged steps, groups
-    #: of states); none without
-    shares: tuple[tuple[tuple[float, ...], ...], ...] = ()
+    #: of states); empty of a structure without a correction
+    correction_shares: tuple[tuple[tuple[float, ...], ...], ...] = ()
 
     @property
     def name(self) -> str:
         """The structure in words."""
-        words = [self.base, *(addition.words for addition in self.additions)]
+        labels = [self.base, *(addition.label for addition in self.additions)]
         if self.parts:
-            words = [f"{part.name} for {_words(groups)}" for part, groups in self.parts]
+            labels = [
+                f"{part.name} for {_enumeration(groups)}" for part, groups in self.parts
+            ]
         if self.gps:
-            words.append(f"GP on {_words([gp.words for gp in self.gps])}")
-        if self.shares:
-            words.append("corrected by the past")
-        return ", ".join(words)
+            labels.append(f"GP on {_enumeration([gp.label for gp in self.gps])}")
+        if self.correction_shares:
+            labels.append("corrected by the past")
+        return ", ".join(labels)
 
     @property
     def key(self) -> str:
         """The structure in the memory of a search."""
-        words = [self.base, *sorted(addition.key for addition in self.additions)]
+        keys = [self.base, *sorted(addition.key for addition in self.additions)]
         for part, groups in self.parts:
-            words.append(f"({part.key}:{'+'.join(groups)})")
-        words += sorted(gp.key for gp in self.gps)
-        if self.shares:
-            words.append("corrected")
-        return "/".join(words)
+            keys.append(f"({part.key}:{'+'.join(groups)})")
+        keys += sorted(gp.key for gp in self.gps)
+        if self.correction_shares:
+            keys.append("corrected")
+        return "/".join(keys)
 
     @property
     def size(self) -> int:
@@ -148,18 +169,18 @@ class Structure:
 
         A correction is none: it hedges against runs that are unlike those of the log.
         """
-        parts = sum(part.size for part, _ in self.parts)
-        return len(self.additions) + len(self.gps) + parts
+        pieces_of_parts = sum(part.size for part, _ in self.parts)
+        return len(self.additions) + len(self.gps) + pieces_of_parts
 
     @property
     def nominal(self) -> "Structure":
         """The structure without GPs and correction."""
-        return replace(self, gps=(), shares=())
+        return replace(self, gps=(), correction_shares=())
 
     @property
     def uncorrected(self) -> "Structure":
         """The structure without its correction."""
-        return replace(self, shares=())
+        return replace(self, correction_shares=())
 
     def extended(self, addition: Addition) -> "Structure | None":
         """Returns the structure with an addition; None where that makes no sense."""
@@ -175,13 +196,13 @@ class Structure:
         return replace(self, gps=tuple(sorted(gps)))
 
 
-def _words(names: Sequence[str]) -> str:
-    """Returns names as words: "a, b and c"."""
-    *first, last = names
-    return f"{', '.join(first)} and {last}" if first else last
+def _enumeration(names: Sequence[str]) -> str:
+    """Returns names as an enumeration: "a, b and c"."""
+    *before, final = names
+    return f"{', '.join(before)} and {final}" if before else final
 
 
-def most_reach(log: Log, for_control: bool) -> int:
+def affordable_rows_back(log: Log, for_control: bool) -> int:
     """Returns how many rows a structure of a log may look back on.
 
     It is a tenth of a piece as most rows are in. Beyond that, short runs leave few
@@ -189,67 +210,71 @@ def most_reach(log: Log, for_control: bool) -> int:
     nothing: there it is as many as they need.
     """
     if for_control:
-        return _REACHES[-1]
+        return _ROWS_BACK[-1]
     lengths = sorted(end - begin for run in log for begin, end in run.pieces)
     rows = np.cumsum(lengths)
     typical = lengths[int(np.searchsorted(rows, rows[-1] / 2))]
     affordable = typical // _PIECE_SHARE
-    return max([reach for reach in _REACHES if reach <= affordable], default=0)
+    return max([rows for rows in _ROWS_BACK if rows <= affordable], default=0)
 
 
-def rows_late(log: Log, reach: int) -> int:
+def likely_delay_rows(log: Log, most_rows_back: int) -> int:
     """Returns by how many rows the inputs of a log are likely to act late.
 
     That of a multirotor's motors is known.
 
     Args:
         log: All runs.
-        reach: Most rows that a structure may look back on.
+        most_rows_back: That a structure may look back on.
     """
     if log.mapping.model == "rigid_body":
         return 0
-    return likely_delay(log, Increments(log.space), min(reach, MOST_ROWS))
+    return likely_delay(log, Increments(log.space), min(most_rows_back, MOST_ROWS))
 
 
-def past_rows(reach: int, late: int = 0) -> int:
+def past_rows_needed(most_rows_back: int, delay_rows: int = 0) -> int:
     """Returns the rows before a start that structures need at most.
 
     Args:
-        reach: Most rows that they may look back on.
-        late: Rows by which inputs are likely to act late.
+        most_rows_back: That they may look back on.
+        delay_rows: By which inputs are likely to act late.
     """
-    return max(PAST, reach) + max(LATE, late + 1) + 1
+    # A likely delay is tried with one row more as well. The last row is to spare.
+    longest_delay = max(MOTOR_DELAY_ROWS, delay_rows + 1)
+    return max(PAST, most_rows_back) + longest_delay + 1
 
 
-def bases(log: Log, reach: int, late: int = 0) -> list[Structure]:
+def bases(log: Log, most_rows_back: int, delay_rows: int = 0) -> list[Structure]:
     """Returns the structures that a search begins with, all of which are tried.
 
     Args:
         log: All runs.
-        reach: Most rows that they may look back on.
-        late: Rows by which inputs are likely to act late.
+        most_rows_back: That they may look back on.
+        delay_rows: By which inputs are likely to act late.
     """
-    structures = _bases(log, reach)
-    return [replace(structure, late=late) for structure in structures]
+    structures = _bases(log, most_rows_back)
+    return [replace(structure, delay_rows=delay_rows) for structure in structures]
 
 
-def _bases(log: Log, reach: int) -> list[Structure]:
+def _bases(log: Log, most_rows_back: int) -> list[Structure]:
     """Returns the bases, whose inputs act at once."""
     if log.mapping.model == "rigid_body":
         body = RigidBodyKinematics(log.space)
-        affine_bases = _affine_bases(body, len(log.input_names), reach)
-        return [_multirotor_base(log, reach), *affine_bases]
+        affine_bases = _affine_bases(body, len(log.input_names), most_rows_back)
+        return [_multirotor_base(log, most_rows_back), *affine_bases]
     kinematics = Increments(log.space)
     ranges = _ranges_of_features(kinematics, log)
-    affine_bases = _affine_bases(kinematics, len(log.input_names), reach, ranges)
+    affine_bases = _affine_bases(
+        kinematics, len(log.input_names), most_rows_back, ranges
+    )
     nominal = system_nominal(log)
     if nominal is None:
         return affine_bases
-    return [_system_base(nominal, kinematics, log, reach), *affine_bases]
+    return [_system_base(nominal, kinematics, log, most_rows_back), *affine_bases]
 
 
 def _system_base(
-    nominal: SystemNominal, kinematics: Increments, log: Log, reach: int
+    nominal: SystemNominal, kinematics: Increments, log: Log, most_rows_back: int
 ) -> Structure:
     model = LogModel(
         kinematics=kinematics,
@@ -258,10 +283,10 @@ def _system_base(
         history=(0,) * len(kinematics.output_names),
     )
     name = nominal.code.rpartition(":")[2]
-    return Structure(name, model, len(log.input_names), reach)
+    return Structure(name, model, len(log.input_names), most_rows_back)
 
 
-def _multirotor_base(log: Log, reach: int) -> Structure:
+def _multirotor_base(log: Log, most_rows_back: int) -> Structure:
     nominal = MultirotorNominal(
         motors=len(log.input_names),
         voltage=_median_voltage(log),
@@ -273,7 +298,7 @@ def _multirotor_base(log: Log, reach: int) -> Structure:
         theta=np.empty(0),
         history=(0,) * 6,
     )
-    return Structure("rigid body", model, len(log.input_names), reach)
+    return Structure("rigid body", model, len(log.input_names), most_rows_back)
 
 
 def _ranges_of_features(
@@ -294,7 +319,7 @@ def _ranges_of_features(
 def _affine_bases(
     kinematics: Kinematics,
     inputs: int,
-    reach: int,
+    most_rows_back: int,
     ranges: tuple[tuple[float, ...], ...] = (),
 ) -> list[Structure]:
     """Returns outputs of zero, and outputs that are affine in the features."""
@@ -311,7 +336,7 @@ def _affine_bases(
                 history=(0,) * len(kinematics.output_names),
             ),
             inputs,
-            reach,
+            most_rows_back,
             ranges,
         )
         for fitted, name in names.items()
@@ -324,24 +349,24 @@ def additions(structure: Structure) -> tuple[Addition, ...]:
         return ()
     lags = Addition(
         key="first_order_lags",
-        words="first-order lags",
+        label="first-order lags",
         extend=_with_lags(structure.inputs),
-        reach=LAG_ROWS,
+        rows_back=LAG_FILL_ROWS,
     )
     if isinstance(structure.model.nominal, MultirotorNominal):
-        memories = _body_memories(structure.reach)
-        alone = _alone_additions(structure.model)
-        possible = (*_MULTIROTOR_ADDITIONS, *memories, lags, *alone)
+        memories = _body_memories(structure.most_rows_back)
+        by_past_rows = _additions_by_past_rows(structure.model)
+        possible = (*_MULTIROTOR_ADDITIONS, *memories, lags, *by_past_rows)
     else:
         possible = (
             *_AFFINE_ADDITIONS,
-            *_late_additions(structure.late),
+            *_delay_additions(structure.delay_rows),
             *_MEMORY_ADDITIONS,
             *_product_additions(structure),
             lags,
             _REFINED,
         )
-    return tuple(one for one in possible if one.reach <= structure.reach)
+    return tuple(one for one in possible if one.rows_back <= structure.most_rows_back)
 
 
 def _median_voltage(log: Log) -> float:
@@ -366,23 +391,29 @@ def _with_memory(memory: Memory) -> Callable[[LogModel], LogModel | None]:
 
 
 _MEMORY_ADDITIONS = tuple(
-    Addition(key, words, _with_memory(memory), False, memory.reach)
-    for key, (words, memory) in _MEMORIES.items()
+    Addition(
+        key=key,
+        label=label,
+        extend=_with_memory(memory),
+        for_control=False,
+        rows_back=memory.rows_back,
+    )
+    for key, (label, memory) in _MEMORIES.items()
 )
 
 
 _SHARES_OF_DELAY = (0.2, 0.4, 0.6, 0.8)  # of a likely delay, which are tried as well
-_REACHES = sorted({LAG_ROWS, *(one.reach for one in _MEMORY_ADDITIONS)})
+_ROWS_BACK = sorted({LAG_FILL_ROWS, *(one.rows_back for one in _MEMORY_ADDITIONS)})
 
 
-def _body_memories(reach: int) -> tuple[Addition, ...]:
+def _body_memories(most_rows_back: int) -> tuple[Addition, ...]:
     """Returns the memories of a rigid body: rows with means, where these are filled.
 
     Rows alone are enough of few signals, whose outputs have no physics.
     """
     keys = ("rows_and_means", "rows8")
     memories = tuple(one for one in _MEMORY_ADDITIONS if one.key in keys)
-    if all(one.reach <= reach for one in memories):
+    if all(one.rows_back <= most_rows_back for one in memories):
         return memories
     return _MEMORY_ADDITIONS
 
@@ -395,8 +426,12 @@ def _product_additions(structure: Structure) -> list[Addition]:
     for rows, degree in _PRODUCTS:
         products = Products(rows, degree, low, high)
         if len(products.factors) <= _MOST_PRODUCTS:
-            words = f"products of {_COUNTS[degree]}"
-            addition = Addition("products", words, _with_products(products), False)
+            addition = Addition(
+                key="products",
+                label=f"products of {_COUNTS[degree]}",
+                extend=_with_products(products),
+                for_control=False,
+            )
             return [addition]
     return []
 
@@ -413,36 +448,35 @@ def _with_products(products: Products) -> Callable[[LogModel], LogModel | None]:
     return extend
 
 
-def _late_additions(late: int) -> list[Addition]:
+def _delay_additions(delay_rows: int) -> list[Addition]:
     """Returns delays of the inputs up to a likely one; none of none.
 
     What looks like one may be a shorter one and a first-order lag.
     """
-    if not late:
+    if not delay_rows:
         return []
-    shorter = {max(round(share * late), 1) for share in _SHARES_OF_DELAY}
-    rows = sorted({late, late + 1} | shorter)
+    shorter = {max(round(share * delay_rows), 1) for share in _SHARES_OF_DELAY}
+    delays = sorted({delay_rows, delay_rows + 1} | shorter)
     return [
         Addition(
             key=f"late:{number}",
-            words=_late_words(number),
+            label=_delay_label(number),
             extend=_with_delay(number),
-            reach=number,
+            rows_back=number,
         )
-        for number in rows
+        for number in delays
     ]
 
 
-def _late_words(rows: int) -> str:
+def _delay_label(rows: int) -> str:
     return f"inputs {rows} {'row' if rows == 1 else 'rows'} late"
 
 
 def _with_delay(rows: int) -> Callable[[LogModel], LogModel | None]:
     def extend(model: LogModel) -> LogModel | None:
         nominal = model.nominal
-        is_still = isinstance(nominal, AffineNominal) and not nominal.fitted
         # A memory knows the past inputs.
-        if model.lag or is_still or not model.memory.empty:
+        if model.lag or is_still(nominal) or not model.memory.empty:
             return None
         return replace(model, lag=rows)
 
@@ -458,26 +492,28 @@ def _with_refined_term(model: LogModel) -> LogModel | None:
 
 _REFINED = Addition(
     key="refined",
-    words="fitted on rollouts",
+    label="fitted on rollouts",
     extend=_with_refined_term,
     for_control=False,
 )
 
 
-def _alone_additions(model: LogModel) -> tuple[Addition, ...]:
+def _additions_by_past_rows(model: LogModel) -> tuple[Addition, ...]:
     """Returns one addition a group: past rows alone predict it, without the physics."""
     return tuple(
         Addition(
             key=f"alone:{name}",
-            words=f"{name} by past rows alone",
-            extend=_alone(outputs),
+            label=f"{name} by past rows alone",
+            extend=_without_physics_of(outputs),
             for_control=False,
         )
         for name, outputs in model.kinematics.output_groups.items()
     )
 
 
-def _alone(outputs: tuple[int, ...]) -> Callable[[LogModel], LogModel | None]:
+def _without_physics_of(
+    outputs: tuple[int, ...],
+) -> Callable[[LogModel], LogModel | None]:
     def extend(model: LogModel) -> LogModel | None:
         if model.memory.empty or set(outputs) <= set(model.without_nominal):
             return None
@@ -490,8 +526,7 @@ def _alone(outputs: tuple[int, ...]) -> Callable[[LogModel], LogModel | None]:
 def _with_lags(inputs: int) -> Callable[[LogModel], LogModel | None]:
     def extend(model: LogModel) -> LogModel | None:
         nominal = model.nominal
-        is_still = isinstance(nominal, AffineNominal) and not nominal.fitted
-        if len(model.time_constants) or (is_still and model.memory.empty):
+        if len(model.time_constants) or (is_still(nominal) and model.memory.empty):
             return None
         if not inputs or model.memory.products is not None:  # which see their past
             return None
@@ -523,10 +558,10 @@ def _with_feedback(model: LogModel) -> LogModel:
     return replace(model, nominal=replace(_multirotor(model), feedback=True))
 
 
-def _with_late_inputs(model: LogModel) -> LogModel | None:
+def _with_motor_delay(model: LogModel) -> LogModel | None:
     if not _multirotor(model).torque:
         return None
-    return replace(model, lag=LATE)
+    return replace(model, lag=MOTOR_DELAY_ROWS)
 
 
 def _with_torque_disturbance(model: LogModel) -> LogModel | None:
@@ -544,6 +579,6 @@ _MULTIROTOR_ADDITIONS = (
     Addition("force_disturbance", "force disturbance", _with_force_disturbance),
     Addition("motor_torque", "motor torque", _with_motor_torque),
     Addition("feedback", "feedback", _with_feedback, for_control=False),
-    Addition("lag", f"inputs {LATE} rows late", _with_late_inputs),
+    Addition("lag", f"inputs {MOTOR_DELAY_ROWS} rows late", _with_motor_delay),
     Addition("torque_disturbance", "torque disturbance", _with_torque_disturbance),
 )

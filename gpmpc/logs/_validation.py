@@ -26,7 +26,7 @@ from gpmpc.models._windows import Windows
 
 _CORRECTED_WINDOWS = 2400  # that a correction is fitted to
 _WINDOWS_WITHOUT_MODEL = 6000  # likewise, where it needs no rollout of a model
-#: of models of all rows, by those of three quarters and of halves
+#: Rows grow by 4/3 from three quarters to all, by 3/2 from halves to three quarters.
 _GAIN_EXPONENT = np.log(4 / 3) / np.log(3 / 2)
 #: ranges of a state in the log, by which a rollout that a correction is fitted to may
 #: leave it
@@ -36,23 +36,32 @@ _LARGEST_DEPARTURE = 1e6
 class _Validation(NamedTuple):
     """Held-out rows, and a model without a correction that was fitted to the others."""
 
+    fold: int  # number of the fold, of whose held-out rows they are all or a half
     train: Log  # the others
     held_out: Log
     model: LogModel
     rollouts: Rollouts  # of the held-out rows
 
 
+class _Quarter(NamedTuple):
+    """A half of what a fold holds out, and all other rows."""
+
+    fold: int  # number of the fold
+    rows: Fold
+
+
 class Validations:
     """Structures fitted to parts of the rows, and rolled out on the others.
 
-    Models of half the rows err more than the one of all. Here three quarters are fitted
-    to, where there are rows enough for windows.
+    Models of half the rows err more than the one of all. So where there are two folds,
+    corrections and the noise are fitted to rollouts of models of three quarters, if
+    there are rows enough for windows; else to those of the folds' own models.
 
     Args:
         log: All runs.
         folds: Of the log.
         fits: Of structures.
-        past: Rows that any of them needs before the start of a rollout.
+        past_rows: That any of them needs before the start of a rollout.
         steps: Of the rollouts.
         judged_steps: Those at which corrections are fitted.
     """
@@ -62,18 +71,18 @@ class Validations:
         log: Log,
         folds: Sequence[Fold],
         fits: StructureFits,
-        past: int,
+        past_rows: int,
         steps: int,
         judged_steps: tuple[int, ...],
     ):
         self._log = log
         self._folds = folds
         self._fits = fits
-        self._past = past
+        self._past_rows = past_rows
         self._steps = steps
         self._judged_steps = judged_steps
         self._validations: dict[str, list[_Validation]] = {}
-        self._models: dict[str, list[LogModel]] = {}  # of the folds, corrected
+        self._corrected_models: dict[str, list[LogModel]] = {}  # of the folds
         self._fold_rollouts: dict[str, list[Rollouts]] = {}
         states = np.concatenate([run.states for run in log])
         low = states.min(axis=0)
@@ -89,26 +98,29 @@ class Validations:
 
         There is none where rollouts diverge on all that a model was not fitted to.
         """
-        parts = [one.rollouts for one in self._validate(structure)]
-        parts_of_folds = self._rollouts_of_folds(structure)
-        if not all(len(rollouts.windows) for rollouts in (*parts, *parts_of_folds)):
+        rollouts = [one.rollouts for one in self._validate(structure)]
+        rollouts_of_folds = self._rollouts_of_folds(structure)
+        if not all(len(one.windows) for one in (*rollouts, *rollouts_of_folds)):
             return None
         return choose_averages(
             kinematics=structure.model.kinematics,
-            rollouts=Rollouts.concatenate(parts),
+            rollouts=Rollouts.concatenate(rollouts),
             judged_steps=self._judged_steps,
             constant_states=self._constant_states(self._log),
         )
 
-    def models(self, structure: Structure) -> list[LogModel]:
-        """Returns the models of a structure, one of each fold, with corrections."""
+    def corrected_models(self, structure: Structure) -> list[LogModel]:
+        """Returns the models of a structure, one of each fold, with its correction.
+
+        Those of a structure without one are the models that ``StructureFits`` has.
+        """
         models = self._fits.models(structure)
-        if not structure.shares:
+        if not structure.correction_shares:
             return models
-        if structure.key not in self._models:
+        if structure.key not in self._corrected_models:
             rollouts = self._rollouts_of_folds(structure)
             # What one fold holds out, the models of the others were fitted to.
-            self._models[structure.key] = [
+            self._corrected_models[structure.key] = [
                 self._correct(
                     model=model,
                     structure=structure,
@@ -117,7 +129,7 @@ class Validations:
                 )
                 for i, (model, fold) in enumerate(zip(models, self._folds, strict=True))
             ]
-        return self._models[structure.key]
+        return self._corrected_models[structure.key]
 
     def _rollouts_of_folds(self, structure: Structure) -> list[Rollouts]:
         """Rolls the models of the folds out on what is held out, uncorrected."""
@@ -149,10 +161,9 @@ class Validations:
         # Of many runs, how unlike they are decides, not how many rows they have.
         if not has_halves or len(self._log.runs) >= MANY_RUNS:
             return noise
-        of_halves = self.models(structure)
+        of_halves = self.corrected_models(structure)
         gains = learning_gains(
-            # Two quarters of each fold, in its order (``_quarters``).
-            fewer=[of_halves[i // 2] for i in range(len(validations))],
+            fewer=[of_halves[validation.fold] for validation in validations],
             models=models,
             logs=held_out,
             steps=noise.steps,
@@ -173,69 +184,82 @@ class Validations:
         return replace(fit, model=model)
 
     def _validate(self, structure: Structure) -> list[_Validation]:
-        """Fits a structure to parts of the rows, and rolls it out on the others.
-
-        Models of half the rows err more than the one of all. Here three quarters are
-        fitted to, where there are rows enough for windows.
-        """
-        structure = replace(structure, shares=())
+        """Fits a structure to parts of the rows, and rolls it out on the others."""
+        structure = replace(structure, correction_shares=())
         if structure.key not in self._validations:
-            folds, models = self._validation_models(structure)
-            self._validations[structure.key] = [
-                _Validation(
-                    train=fold.train,
-                    held_out=fold.held_out,
-                    model=model,
-                    rollouts=self._rollouts(model, fold.held_out),
-                )
-                for fold, model in zip(folds, models, strict=True)
-            ]
+            validations = None
+            if len(self._folds) == 2:
+                validations = self._validate_on_quarters(structure)
+            if validations is None:
+                models = self._fits.models(structure)
+                validations = [
+                    self._validation(number, fold, model)
+                    for number, (fold, model) in enumerate(
+                        zip(self._folds, models, strict=True)
+                    )
+                ]
+            self._validations[structure.key] = validations
         return self._validations[structure.key]
 
-    def _validation_models(
-        self, structure: Structure
-    ) -> tuple[Sequence[Fold], list[LogModel]]:
-        """Returns folds with three quarters to fit to, if there are rows enough."""
-        if len(self._folds) == 2:
-            try:
-                folds = self._quarters()
-                return folds, [
-                    self._fits.fit_to(fold.train, structure).model for fold in folds
-                ]
-            except DataError:
-                pass
-        return self._folds, self._fits.models(structure)
+    def _validate_on_quarters(self, structure: Structure) -> list[_Validation] | None:
+        """Fits a structure to three quarters of the rows; None where they are few."""
+        try:
+            quarters = self._quarters()
+            models = [
+                self._fits.fit_to(quarter.rows.train, structure).model
+                for quarter in quarters
+            ]
+        except DataError:
+            return None
+        return [
+            self._validation(quarter.fold, quarter.rows, model)
+            for quarter, model in zip(quarters, models, strict=True)
+        ]
 
-    def _quarters(self) -> list[Fold]:
-        """Halves what each fold holds out, every other run or block of it.
+    def _validation(self, number: int, rows: Fold, model: LogModel) -> _Validation:
+        """Rolls out a model on the rows that it was not fitted to.
 
-        Two quarters of the first fold, then two of the second.
+        Args:
+            number: Of the fold.
+            rows: Those of the fold, or a quarter of it.
+            model: Without a correction.
+        """
+        return _Validation(
+            fold=number,
+            train=rows.train,
+            held_out=rows.held_out,
+            model=model,
+            rollouts=self._rollouts(model, rows.held_out),
+        )
+
+    def _quarters(self) -> list[_Quarter]:
+        """Halves what each of two folds holds out, every other run or block of it.
 
         Raises:
             DataError: One would be without windows.
         """
         quarters = []
-        for fold in self._folds:
+        for number, fold in enumerate(self._folds):
             runs = fold.held_out.runs
             for first in range(2):
                 held_out_runs = runs[first::2]
                 other_half = runs[1 - first :: 2]
                 train_runs = (*fold.train.runs, *other_half)
-                quarter = Fold(
+                rows = Fold(
                     train=replace(fold.train, runs=train_runs),
                     held_out=replace(fold.held_out, runs=held_out_runs),
                 )
-                quarter.held_out.windows(self._steps, past=self._past, most=1)
-                quarters.append(quarter)
+                rows.held_out.windows(self._steps, past=self._past_rows, most=1)
+                quarters.append(_Quarter(number, rows))
         return quarters
 
     def _rollouts(self, model: LogModel, held_out: Log) -> Rollouts:
         """Rolls a model out on held-out rows, and leaves out what diverges."""
-        share = len(held_out) / len(self._log)
+        fraction = len(held_out) / len(self._log)
         windows = held_out.windows(
             ahead=self._steps,
             past=max(model.past, PAST),
-            most=max(round(share * _CORRECTED_WINDOWS), 1),
+            most=max(round(fraction * _CORRECTED_WINDOWS), 1),
         )
         with np.errstate(over="ignore", invalid="ignore"):
             predicted = model.rollout(windows)
@@ -288,13 +312,13 @@ class Validations:
             rollouts: That are corrected.
             fitted_to: Rows that the model was fitted to.
         """
-        if not structure.shares:
+        if not structure.correction_shares:
             return model
         correction = fit_correction(
             kinematics=model.kinematics,
             rollouts=Rollouts.concatenate(rollouts),
             judged_steps=self._judged_steps,
             constant_states=self._constant_states(fitted_to),
-            shares=np.array(structure.shares),
+            shares=np.array(structure.correction_shares),
         )
         return replace(model, correction=correction)

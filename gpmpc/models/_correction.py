@@ -30,8 +30,8 @@ from gpmpc.gp._data_checks import constant_columns
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._windows import Windows
 
-LAGS = (1, 2, 3, 5, 8, 12, 20)  # rows of the past that it sees
-BINS = 5  # means of the inputs to come that it sees
+ROWS_SEEN = (1, 2, 3, 5, 8, 12, 20)  # of the past, counted back from the start
+BINS = 5  # means of the inputs to come that a correction sees
 PENALTY = 0.01  # of squared coefficients of standardised columns, per row
 
 
@@ -65,7 +65,7 @@ class Correction:
 
         Args:
             kinematics: Has the features of the start.
-            windows: W of them, with ``max(LAGS)`` rows of past or more.
+            windows: W of them, with ``max(ROWS_SEEN)`` rows of past or more.
             predicted: Rollouts (W, K, n).
             steps: At which a regression stands.
             priors: Of the coefficients.
@@ -271,11 +271,11 @@ def _regressors(
     inputs = windows.inputs
     start = windows.states[:, past]
     columns = [kinematics.features(start, inputs[:, past], windows.context[:, past])]
-    for lag in LAGS:
-        earlier = windows.states[:, past - lag]
+    for rows in ROWS_SEEN:
+        earlier = windows.states[:, past - rows]
         columns.append(windows.space.difference(start, earlier))
-    for lag in LAGS:
-        columns.append(inputs[:, past - lag])
+    for rows in ROWS_SEEN:
+        columns.append(inputs[:, past - rows])
     for rows in np.array_split(np.arange(step), min(BINS, step)) if step else ():
         columns.append(inputs[:, past + rows].mean(axis=1))
     missing = max(BINS - step, 0) * inputs.shape[-1]
@@ -293,13 +293,13 @@ def _at_rest(windows: Windows, regressors: Array) -> NDArray[np.bool_]:
     space = windows.space
     starts = windows.states[:, windows.past]
     entries = np.abs(space.difference(starts, space.origin)).max(axis=0)
-    input_columns = (len(LAGS) + BINS) * windows.inputs.shape[-1]
-    differences = (len(LAGS) + 1) * len(entries)
+    input_columns = (len(ROWS_SEEN) + BINS) * windows.inputs.shape[-1]
+    differences = (len(ROWS_SEEN) + 1) * len(entries)
     features = regressors.shape[1] - differences - input_columns
     magnitudes = np.concatenate(
         [
             np.zeros(features),  # those and the inputs have their own
-            np.tile(entries, len(LAGS)),
+            np.tile(entries, len(ROWS_SEEN)),
             np.zeros(input_columns),
             entries,
         ]

@@ -23,7 +23,7 @@ from gpmpc._dynamics import Array
 from gpmpc.exceptions import SettingError
 from gpmpc.gp import GPPosterior
 from gpmpc.models._actuators import FirstOrderLags
-from gpmpc.models._correction import LAGS, Correction, StartFilter
+from gpmpc.models._correction import ROWS_SEEN, Correction, StartFilter
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._memory import NO_MEMORY, Memory
 from gpmpc.models._parametric import ParametricNominal, feedback_outputs
@@ -31,7 +31,7 @@ from gpmpc.models._roll_out import iterate
 from gpmpc.models._windows import Windows
 
 DIVERGED = 1e9  # error of a rollout that is not finite
-LAG_ROWS = 40  # from which the state of first-order lags is known
+LAG_FILL_ROWS = 40  # from which the state of first-order lags is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,12 +116,15 @@ class LogModel:
 
     @property
     def past(self) -> int:
-        """Number of rows that a prediction needs before its start."""
-        lag_rows = LAG_ROWS if len(self.time_constants) else 0
-        rows = max(*self.history, self.memory.reach, lag_rows) + self.lag
+        """Number of rows that a prediction needs before its start.
+
+        Those that a correction or a start filter sees are among them.
+        """
+        fill_rows = LAG_FILL_ROWS if len(self.time_constants) else 0
+        rows = max(*self.history, self.memory.rows_back, fill_rows) + self.lag
         if self.correction is None and self.start_filter is None:
             return rows
-        return max(rows, *LAGS)
+        return max(rows, *ROWS_SEEN)
 
     @property
     def feedback_outputs(self) -> tuple[int, ...]:
@@ -377,7 +380,7 @@ class LogModel:
 
         Args:
             windows: Of W.
-            rows: That are wanted; they begin at ``lag`` or later.
+            rows: Rows of the windows; they begin at ``lag`` or later.
             time_constants: As in ``step``, one for each input (T, 1, m), to compute
                 many side by side.
 
@@ -440,6 +443,7 @@ class LogModel:
         start = windows.past
         states = windows.states[:, start]
         next_states = windows.states[:, start + 1]
+        # The measured outputs begin at the measured state: so do those of the model.
         unfiltered = replace(self, start_filter=None)
         predicted = unfiltered.rollout_carried(windows, 1)[:, 1, : states.shape[-1]]
         outputs = self.kinematics.outputs
@@ -495,7 +499,7 @@ class LogModel:
 
         Args:
             windows: W of them.
-            rows: That are wanted; they begin at ``lag`` or later.
+            rows: Rows of the windows; they begin at ``lag`` or later.
 
         Returns:
             The features (W, rows, d), and what the nominal part leaves of the outputs

@@ -150,8 +150,8 @@ class Memory:
         return not self.copies and not self.output_decays
 
     @property
-    def reach(self) -> int:
-        """Number of rows from which it is filled; older ones hardly count."""
+    def rows_back(self) -> int:
+        """Number of past rows from which it is filled; older ones hardly count."""
         if self.empty:
             return 0
         slowest = max((*self.decays, *self.output_decays, 0.0))

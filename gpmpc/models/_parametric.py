@@ -181,3 +181,8 @@ class AffineNominal:
         A = weights[:, :-1]
         b = weights[:, -1]
         return self.kinematics.features(states, inputs, context) @ A.T + b
+
+
+def is_still(nominal: ParametricNominal) -> bool:
+    """Returns whether a nominal model says that no state moves."""
+    return isinstance(nominal, AffineNominal) and not nominal.fitted

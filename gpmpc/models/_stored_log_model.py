@@ -27,7 +27,7 @@ from gpmpc.gp._storage import (
     posterior_parts,
     read_model,
 )
-from gpmpc.models._correction import BINS, LAGS, Correction, StartFilter
+from gpmpc.models._correction import BINS, ROWS_SEEN, Correction, StartFilter
 from gpmpc.models._grouped import GroupedNominal
 from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
 from gpmpc.models._log_dynamics import LogDynamics, OutputNoise
@@ -334,8 +334,8 @@ def _memory(fields: Any) -> Memory:
         output_decays=tuple(decays[1]),
         products=_products(fields.get("products")),
     )
-    if memory.reach > _LONGEST:
-        raise DataError(f"a memory reaches back {memory.reach} rows")
+    if memory.rows_back > _LONGEST:
+        raise DataError(f"a memory reaches back {memory.rows_back} rows")
     return memory
 
 
@@ -533,7 +533,7 @@ def _regression_arrays(
     arrays = {key: tensors[f"{name}/{key}"].numpy() for key in _REGRESSION_TENSORS}
     e = kinematics.space.error_dim
     m = len(input_names)
-    r = feature_count + len(LAGS) * (e + m) + BINS * m + e
+    r = feature_count + len(ROWS_SEEN) * (e + m) + BINS * m + e
     check_shape(f"{name}/mean", arrays["mean"], (*batch, r))
     check_shape(f"{name}/deviation", arrays["deviation"], (*batch, r))
     check_shape(f"{name}/weights", arrays["weights"], (*batch, 1 + r, e))

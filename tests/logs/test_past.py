@@ -134,7 +134,7 @@ def test_a_structure_has_the_same_penalties_in_every_fold():
     log = tanks(0, rows=320, noise=0.0)
     folds = split_folds(log, past=10, steps=20)
     base = next(one for one in bases(log, 10) if one.base == CONSTANT_STATE)
-    four_rows = next(one for one in additions(base) if one.reach == 4)
+    four_rows = next(one for one in additions(base) if one.rows_back == 4)
     structure = base.extended(four_rows)
     assert structure is not None
     fits = StructureFits(
@@ -144,7 +144,7 @@ def test_a_structure_has_the_same_penalties_in_every_fold():
         points=10,
         steps=20,
         seed=0,
-        memory={},
+        results={},
     )
     penalties = choose_penalties(structure.model, log, steps=20)
     assert penalties[0] < 1e-2  # less than where none can be chosen: without noise

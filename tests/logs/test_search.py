@@ -32,10 +32,10 @@ from gpmpc.logs._search import Search
 from gpmpc.logs._smoothing import smooth
 from gpmpc.logs._structures import (
     additions,
+    affordable_rows_back,
     bases,
-    most_reach,
-    past_rows,
-    rows_late,
+    likely_delay_rows,
+    past_rows_needed,
 )
 from gpmpc.models import LogModel
 from gpmpc.models._correction import Correction, Prior
@@ -104,7 +104,7 @@ def test_a_transient_and_its_rest_are_in_all_folds():
     blocks = [run for fold in folds.parts for run in fold.held_out]
     assert sum(len(run) - 23 for run in blocks) == 600 - 23
     halves = split_folds(log_of([states[:90]], [np.zeros((90, 1))]), past=23, steps=10)
-    assert "halves" in halves.words
+    assert "halves" in halves.method
     long = split_folds(log_of([np.tile(states, (6, 1))], [np.zeros((3600, 1))]), 23, 10)
     assert (len(folds.parts), len(long.parts)) == (4, 2)
 
@@ -137,9 +137,11 @@ def test_models_of_all_rows_err_less_where_folds_agree(mistakes, gain):
 )
 def test_short_runs_are_looked_back_on_a_little(rows, reach, longest):
     log = log_of([np.zeros((rows, 2))] * 5, [np.zeros((rows, 1))] * 5)
-    assert most_reach(log, for_control=False) == reach
-    assert most_reach(log, for_control=True) == 40  # lags alone know the past there
-    possible = [one.words for one in additions(bases(log, reach)[0])]
+    assert affordable_rows_back(log, for_control=False) == reach
+    assert (
+        affordable_rows_back(log, for_control=True) == 40
+    )  # lags alone know the past there
+    possible = [one.label for one in additions(bases(log, reach)[0])]
     assert longest in [words[:11] for words in possible]
     assert ("14 past rows" in possible) == (reach >= 14)
 
@@ -154,18 +156,18 @@ def test_inputs_that_act_late_are_known_to_controllers():
         exact = simulate(lambda x, u: [x[1], 4 * u[0] - 2 * x[1]], [0, 0], acting)
         states = exact + rng.normal(size=exact.shape) * [0.002, 0.02]
         logs.append(log_of([states], [commands]))
-    assert [rows_late(log, reach=40) for log in logs] == [0, 3]
+    assert [likely_delay_rows(log, most_rows_back=40) for log in logs] == [0, 3]
     search = Search(
         log=logs[1],
-        folds=split_folds(logs[1], past_rows(40, 3), 5, most=2).parts,
-        reach=40,
+        folds=split_folds(logs[1], past_rows_needed(40, 3), 5, most=2).parts,
+        most_rows_back=40,
         points=10,
         steps=5,
         seed=0,
         progress=lambda text: None,
-        memory={},
+        results={},
         for_control=True,
-        late=3,
+        delay_rows=3,
     )
     search._search_nominals()
     assert search.best.model.lag == 3
@@ -195,12 +197,17 @@ def test_what_is_slower_than_all_that_is_sought_is_no_delay():
     commands = held_inputs(np.random.default_rng(0), 400, 1.0, hold=4)
     acting = np.vstack([np.zeros((30, 1)), commands[:370]])
     states = simulate(lambda x, u: [x[1], 4 * u[0] - 2 * x[1]], [0, 0], acting)
-    assert rows_late(log_of([states], [np.zeros_like(commands)]), reach=40) == 0
-    assert rows_late(log_of([states], [commands]), reach=0) == 0
+    assert (
+        likely_delay_rows(
+            log_of([states], [np.zeros_like(commands)]), most_rows_back=40
+        )
+        == 0
+    )
+    assert likely_delay_rows(log_of([states], [commands]), most_rows_back=0) == 0
     # The longest delay that is sought is found.
     acting = np.vstack([np.zeros((15, 1)), commands[:385]])
     states = simulate(lambda x, u: [x[1], 4 * u[0] - 2 * x[1]], [0, 0], acting)
-    assert rows_late(log_of([states], [commands]), reach=40) == 15
+    assert likely_delay_rows(log_of([states], [commands]), most_rows_back=40) == 15
 
 
 def test_runs_are_dealt_so_that_ranges_are_covered():
@@ -209,7 +216,7 @@ def test_runs_are_dealt_so_that_ranges_are_covered():
     states = [size * rng.uniform(-1, 1, (200, 2)) for size in sizes]
     log = log_of(states, [rng.uniform(-1, 1, (200, 1))] * 6)
     folds = split_folds(log, past=23, steps=10)
-    assert "6 runs" in folds.words
+    assert "6 runs" in folds.method
     for fold in folds.parts:
         wide = [size for run in fold.train for size in [np.abs(run.states).max()]]
         assert max(wide) > 2
@@ -388,7 +395,7 @@ def test_averages_take_what_is_best_on_other_runs():
             judged_steps=(1, 10),
             constant_states=dict.fromkeys((1, 10), still),
         )
-        return averages.ratios
+        return averages.ratios_to_rollout
 
     # What is exact stays; of what only errs, less than the rest is kept.
     np.testing.assert_allclose(ratios(measured), 1.0)
@@ -441,10 +448,10 @@ def test_what_runs_have_each_for_themselves_is_not_corrected():
         )
 
     own = averages(rng.normal(size=(6, 1, 2))[windows.runs])
-    assert (own.ratios > 0.8).all()
+    assert (own.ratios_to_rollout > 0.8).all()
     common = averages(np.ones((len(windows), 1, 2)))
     np.testing.assert_allclose(common.shares.sum(axis=0), 1.0)
-    assert (common.ratios < 0.1).all()
+    assert (common.ratios_to_rollout < 0.1).all()
 
 
 def test_a_run_at_rest_does_not_decide_for_those_that_move():
@@ -462,7 +469,7 @@ def test_a_run_at_rest_does_not_decide_for_those_that_move():
     )
     # Beside a constant state, which is exact at rest, everything else is infinitely
     # far behind there; for the others that state errs fourteen times as much.
-    assert (averages.ratios < 2.0).all()
+    assert (averages.ratios_to_rollout < 2.0).all()
 
 
 def test_intervals_of_a_comparison_hold():
@@ -732,13 +739,13 @@ def tiny_search(log, for_control=False):
     """A search whose bases were considered, and nothing else."""
     search = Search(
         log=log,
-        folds=split_folds(log, past_rows(40), 5).parts,
-        reach=40,
+        folds=split_folds(log, past_rows_needed(40), 5).parts,
+        most_rows_back=40,
         points=10,
         steps=5,
         seed=0,
         progress=lambda text: None,
-        memory={},
+        results={},
         for_control=for_control,
     )
     for base in bases(log, 40):
@@ -775,7 +782,9 @@ def test_a_correction_that_is_the_ridge_regression_alone_is_the_baseline():
     start = next(one for one in search._structures.values() if one.size == 0)
     shares = np.zeros((len(_PRIORS), 2, 2))
     shares[_RIDGE] = 1.0
-    ridge = replace(start, shares=tuple(tuple(map(tuple, one)) for one in shares))
+    ridge = replace(
+        start, correction_shares=tuple(tuple(map(tuple, one)) for one in shares)
+    )
 
     def check(model, fitted_to):
         for step in search.judged_steps:
@@ -786,7 +795,7 @@ def test_a_correction_that_is_the_ridge_regression_alone_is_the_baseline():
             np.testing.assert_allclose(errors, expected, rtol=0, atol=1e-9)
 
     check(search._validations.fit_to_all_runs(ridge).model, log)
-    models = search._validations.models(ridge)
+    models = search._validations.corrected_models(ridge)
     for model, fold in zip(models, search._folds, strict=True):
         check(model, fold.train)
 
