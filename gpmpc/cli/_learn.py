@@ -70,8 +70,8 @@ def learn(arguments: argparse.Namespace) -> Result:
         )
         held_out = split.held_out(learned.model.past)
         logs.save_learned(learned, folder / _MODEL)
-        report = _report(learned, judgement, train, held_out)
-        card = _card(learned, judgement, train, held_out)
+        report = _make_report(learned, judgement, train, held_out)
+        card = _make_card(learned, judgement, train, held_out)
         files = report.files("report")
         files["report.html"] = report.html()
         files["card.md"] = card.markdown()
@@ -100,8 +100,8 @@ def learn(arguments: argparse.Namespace) -> Result:
 def _reasons_against(learned: IdentifiedModel, judgement: Judgement) -> tuple[str, ...]:
     """Returns why a model should not be used; nothing where it may be.
 
-    A model for a controller is not asked to beat a regression that plans nothing, but
-    to know what the inputs do.
+    A model for a controller is not asked to beat the ridge regression, with which none
+    can plan, but to know what the inputs do.
     """
     if learned.control is None:
         return judgement.losses
@@ -124,11 +124,13 @@ def _learn_and_judge(
     folder: Path,
     console: Console,
 ) -> tuple[IdentifiedModel, Judgement]:
-    """Learns with a memory of finished stages, and judges what was learned."""
+    """Learns, with the results of finished stages in a file, and judges the model."""
     train = split.train
-    memory = _FileMemory(folder / "progress.json", _fingerprint(arguments, train))
-    if memory.begun_anew:
-        console.print(memory.begun_anew)
+    results = _StageResults(
+        folder / "progress.json", _fingerprint_of_call(arguments, train)
+    )
+    if results.begun_anew:
+        console.print(results.begun_anew)
     with console.status("learning") as status:
 
         def show(stage: str) -> None:
@@ -141,7 +143,7 @@ def _learn_and_judge(
             steps=arguments.steps,
             seed=arguments.seed,
             progress=show,
-            memory=memory,
+            memory=results,
             for_control=arguments.for_control,
         )
         held_out = split.held_out(learned.model.past)
@@ -153,17 +155,17 @@ def _learn_and_judge(
             raise DataError(text) from error
         longest = min(arguments.steps, most_steps(learned, held_out, train))
         told = max(most_told_steps(learned, held_out), 1)
-        words = ""
+        reason = ""
         if told < longest:
             longest = told
-            words = f": {_of_more_than(told)}"
-        show(f"judging on held-out runs, at most {longest} steps ahead{words}")
+            reason = f": {_of_more_than(told)}"
+        show(f"judging on held-out runs, at most {longest} steps ahead{reason}")
         steps = {step for step in _JUDGED_STEPS if step <= longest} | {longest}
         judgement = logs.judge(learned, held_out, train, sorted(steps))
     return learned, judgement
 
 
-def _fingerprint(arguments: argparse.Namespace, train: Log) -> str:
+def _fingerprint_of_call(arguments: argparse.Namespace, train: Log) -> str:
     """Returns a text that differs where code, data or settings differ."""
     settings = (
         train.mapping,
@@ -234,8 +236,8 @@ def _split(log: Log, held_out: Sequence[str]) -> _Split:
     return _Split(*log.split(middle))
 
 
-class _FileMemory(dict[str, Any]):
-    """Outcomes of stages, kept in a JSON file.
+class _StageResults(dict[str, Any]):
+    """Results of the stages of learning, kept in a JSON file.
 
     Other code, data or settings begin it anew.
 
@@ -248,7 +250,7 @@ class _FileMemory(dict[str, Any]):
         self._path = path
         self._fingerprint = fingerprint
         self._code = code_fingerprint()
-        #: a line that says why the outcomes of an earlier call are not used; "" where
+        #: a line that says why the results of an earlier call are not used; "" where
         #: they are, or where there are none
         self.begun_anew = ""
         try:
@@ -282,7 +284,7 @@ class _FileMemory(dict[str, Any]):
         write_whole(self._path, json.dumps(content))
 
 
-def _report(
+def _make_report(
     learned: IdentifiedModel, judgement: Judgement, train: Log, held_out: Log
 ) -> Document:
     """Returns errors beside the baselines, coverage and width, and every candidate."""
@@ -420,7 +422,7 @@ def _tables_of_effects(learned: IdentifiedModel) -> list[Table]:
     return [Table(header, rows, "What the inputs do: derivatives of the outputs")]
 
 
-def _card(
+def _make_card(
     learned: IdentifiedModel, judgement: Judgement, train: Log, held_out: Log
 ) -> Document:
     """Returns the model card.

@@ -8,7 +8,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gpmpc._dynamics import Array
-from gpmpc.logs._frames import FRD_TURN, NAMES, NED_TURN, Claim, attitudes_to_enu
+from gpmpc.logs._frames import (
+    FRD_TURN,
+    NAMES,
+    NED_TURN,
+    Claim,
+    attitudes_to_enu,
+    other_convention,
+)
 from gpmpc.logs._mapping import Signal
 from gpmpc.logs._mapping_advice import (
     advise_columns,
@@ -86,9 +93,10 @@ def _chain(*functions: Callable[[Array], Array]) -> Callable[[Array], Array]:
 def _axis_changes(claim: Claim) -> Iterator[AttitudeInterpretation]:
     """Yields attitudes in other axes of the world or of the body."""
     name = claim.attitude.name
-    axes = claim.axes[name]
-    other = "ned" if axes == "enu" else "enu"
-    (world, body), (other_world, other_body) = NAMES[axes], NAMES[other]
+    claimed = claim.axes[name]
+    axes = other_convention(claimed)
+    world, body = NAMES[claimed]
+    other_world, other_body = NAMES[axes]
 
     def turn_world(q: Array) -> Array:
         return quaternion_product(NED_TURN, q)
@@ -98,7 +106,7 @@ def _axis_changes(claim: Claim) -> Iterator[AttitudeInterpretation]:
 
     yield AttitudeInterpretation(
         f"{name} is that of a body in {other_body} axes in a world in {other_world} "
-        f"axes, not {body} in {world}: write axes: {other} for {name}",
+        f"axes, not {body} in {world}: write axes: {axes} for {name}",
         1,
         _chain(turn_world, turn_body),
         turns_axes=True,
@@ -111,7 +119,7 @@ def _axis_changes(claim: Claim) -> Iterator[AttitudeInterpretation]:
     )
     yield AttitudeInterpretation(
         f"{name} is that of a body in {body} axes in a world in {other_world} axes, "
-        f"not {world}: write {advise_turned_body(claim.attitude)}, and axes: {other} "
+        f"not {world}: write {advise_turned_body(claim.attitude)}, and axes: {axes} "
         f"for {name}",
         1,
         turn_world,
@@ -129,11 +137,11 @@ def _column_changes(claim: Claim) -> Iterator[AttitudeInterpretation]:
 def _quaternion_changes(signal: Signal) -> Iterator[AttitudeInterpretation]:
     """Yields other meanings of the columns of a quaternion."""
     name = signal.name
-    other = "wxyz" if signal.order == "xyzw" else "xyzw"
-    shift = -1 if other == "wxyz" else 1
+    order = "wxyz" if signal.order == "xyzw" else "xyzw"
+    shift = -1 if order == "wxyz" else 1
     yield AttitudeInterpretation(
-        advice=f"{name} is in the order {other}, not {signal.order}: write order: "
-        f"{other} for {name}",
+        advice=f"{name} is in the order {order}, not {signal.order}: write order: "
+        f"{order} for {name}",
         cost=1,
         attitudes=lambda q: np.roll(q, shift, axis=-1),
     )

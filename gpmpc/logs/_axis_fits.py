@@ -242,12 +242,12 @@ def _plausible(
     return units
 
 
-def correlation(one: Array, other: Array) -> Array:
+def correlation(vectors: Array, references: Array) -> Array:
     """Returns the correlations (3,) of axes of vectors (N, 3), without glitches."""
-    one = _without_glitches(one)
-    other = _without_glitches(other)
-    product = (one * other).sum(axis=0)
-    scale = np.sqrt((one * one).sum(axis=0) * (other * other).sum(axis=0))
+    a = _without_glitches(vectors)
+    b = _without_glitches(references)
+    product = (a * b).sum(axis=0)
+    scale = np.sqrt((a * a).sum(axis=0) * (b * b).sum(axis=0))
     return np.divide(product, scale, out=np.zeros(3), where=scale > 0)
 
 

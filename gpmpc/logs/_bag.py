@@ -306,10 +306,10 @@ class Bag:
                 raise DataError(f"{self.path}: topic {topic!r} has no message")
             if topic not in present:
                 listed = ", ".join(sorted(present)) or "no topics"
-                what = f"topic {topic!r} is missing"
+                fault = f"topic {topic!r} is missing"
                 if not topic:
-                    what = "a bag has topics, and the mapping names none for a signal"
-                raise DataError(f"{self.path}: {what}; it has {listed}")
+                    fault = "a bag has topics, and the mapping names none for a signal"
+                raise DataError(f"{self.path}: {fault}; it has {listed}")
 
     def _findings(self) -> list[Finding]:
         """Returns what was not read, lost or damaged, with numbers."""
@@ -373,8 +373,10 @@ def _records(
             position = file.tell()
             record = _next_record(file, size)
             if record is None:
-                left = size - position
-                note_damage(f"the last {left} of {size} bytes are cut off or no record")
+                unread = size - position
+                note_damage(
+                    f"the last {unread} of {size} bytes are cut off or no record"
+                )
                 return
             kind, content = record
             if kind == Opcode.DATA_END:

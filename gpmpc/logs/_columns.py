@@ -99,13 +99,13 @@ def runs_side_by_side(
 ) -> Iterator[TablesOfRun]:
     """Yields the runs for which the mapping has columns of their own; one without.
 
-    Rows behind the last value of a run belong to longer ones.
+    Rows after the last value of a run belong to longer ones.
 
     Raises:
         DataError: A column is missing.
     """
     if not mapping.runs:
-        yield TablesOfRun("", {**tables, **_until_last_value(tables, mapping)})
+        yield TablesOfRun("", _until_last_value(tables, mapping))
         return
     if "" not in tables:
         raise DataError(f"{path}: has topics, and is one run; runs needs one table")
@@ -118,12 +118,13 @@ def runs_side_by_side(
 
 
 def _until_last_value(tables: Tables, mapping: LogMapping) -> Tables:
-    """Cuts a single table behind the last row in which a column of the mapping has one.
+    """Cuts a single table after the last row in which a column of the mapping has one.
 
-    Stamps count as well: rows without any other value are rows of the run.
+    Stamps count as well: rows without any other value are rows of the run. Tables of
+    topics stay as they are.
     """
     if "" not in tables:
-        return {}
+        return tables
     table = tables[""]
     columns = [
         column
@@ -131,14 +132,14 @@ def _until_last_value(tables: Tables, mapping: LogMapping) -> Tables:
         if column in table
     ]
     if not columns:
-        return {"": table}
+        return tables
     has_value = table[columns].notna().any(axis=1).to_numpy()
     rows = int(np.flatnonzero(has_value)[-1]) + 1 if has_value.any() else len(table)
-    return {"": table.iloc[:rows]}
+    return {**tables, "": table.iloc[:rows]}
 
 
 def padded_table(columns: Mapping[str, np.ndarray]) -> pd.DataFrame:
-    """Makes a table of columns (K,) of different lengths; NaN stands behind short ones.
+    """Makes a table of columns (K,) of different lengths; NaN stands after short ones.
 
     A single number stands in the first row.
     """

@@ -99,8 +99,8 @@ def judge_for_control(
         faults.append("no output of the model depends on any input")
     advice = _excitation(log, names, inputs) if faults else ()
     faults += _hidden_motions(model, log, stride)
-    known = [effect for effect in effects if effect.input not in unknown]
-    warnings = _disagreements(known) + _unstable_loops(model, log, rivals)
+    significant = [effect for effect in effects if effect.input not in unknown]
+    warnings = _disagreements(significant) + _unstable_loops(model, log, rivals)
     return ControlFitness(tuple(effects), tuple(faults), tuple(warnings), advice)
 
 
@@ -228,17 +228,17 @@ def _hidden_motions(model: LogModel, log: Log, stride: int) -> list[str]:
     kinematics = model.kinematics
     if isinstance(kinematics, RigidBodyKinematics):
         return []  # whose state has all velocities
-    past = max(model.past, 2)
+    start = max(model.past, 2)  # row of the windows
     try:
-        windows = log.windows(1, past=past, stride=stride)
+        windows = log.windows(1, past=start, stride=stride)
     except DataError:
         return []
     measured, modelled = model.first_outputs(windows)
     missed = measured - modelled
     states = windows.states
-    context = windows.context[:, past]
-    columns = [kinematics.features(states[:, past], windows.inputs[:, past], context)]
-    for row in (past - 2, past - 1):
+    context = windows.context[:, start]
+    columns = [kinematics.features(states[:, start], windows.inputs[:, start], context)]
+    for row in (start - 2, start - 1):
         columns.append(
             kinematics.outputs(states[:, row], states[:, row + 1], log.time_step)
         )
@@ -248,9 +248,10 @@ def _hidden_motions(model: LogModel, log: Log, stride: int) -> list[str]:
         return []
     regressors -= regressors.mean(axis=0)
     weights = fit_affine(regressors, missed)
-    left = (missed - regressors @ weights[:-1]).var(axis=0) * rows / (rows - count)
+    unexplained = (missed - regressors @ weights[:-1]).var(axis=0)
+    unexplained *= rows / (rows - count)  # without the bias of as many weights
     is_hidden = (missed.var(axis=0) > _MISSED * measured.var(axis=0)) & (
-        left < _TOLD_BY_PAST * missed.var(axis=0)
+        unexplained < _TOLD_BY_PAST * missed.var(axis=0)
     )
     hidden = [kinematics.output_names[i] for i in np.flatnonzero(is_hidden)]
     if not hidden:

@@ -22,7 +22,7 @@ import numpy as np
 from gpmpc.exceptions import DataError
 from gpmpc.logs._axis_fits import FEWEST, SHORTEST_LAG
 from gpmpc.logs._findings import Finding
-from gpmpc.logs._frames import NAMES, Claim
+from gpmpc.logs._frames import NAMES, Claim, other_convention
 from gpmpc.logs._interpretation_advice import mistakes_of
 from gpmpc.logs._interpretations import (
     DOUBTFUL,
@@ -190,13 +190,13 @@ def _unusual(
 
 
 def _upside_down(claim: Claim, lift: float) -> str:
-    other = "ned" if claim.axes[claim.rate.name] == "enu" else "enu"
-    _, other_body = NAMES[other]
+    axes = other_convention(claim.axes[claim.rate.name])
+    _, body = NAMES[axes]
     return (
         f"the force that carries the body points along its own underside "
         f"({lift:.1f} m/s2): it flies on its back, or {claim.attitude.name} is that "
-        f"of a body in {other_body} axes, and so are its rates: write "
-        f"{advise_turned_body(claim.attitude)}, and axes: {other} for "
+        f"of a body in {body} axes, and so are its rates: write "
+        f"{advise_turned_body(claim.attitude)}, and axes: {axes} for "
         f"{claim.rate.name}"
     )
 

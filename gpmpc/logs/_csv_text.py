@@ -158,15 +158,15 @@ class _CsvStream(io.TextIOBase):
     def read(self, size: int | None = -1, /) -> str:
         """Reads the next ``size`` characters; all of them where it is negative."""
         length = len(self._unread)
-        parts = [self._unread]
+        lines = [self._unread]
         while size is None or size < 0 or length < size:
             line = next(self._all_lines, "")
             if not line:
                 break
             self._check_width(line)
-            parts.append(line)
+            lines.append(line)
             length += len(line)
-        text = "".join(parts)
+        text = "".join(lines)
         if size is None or size < 0:
             size = len(text)
         self._unread = text[size:]

@@ -34,6 +34,11 @@ NAMES = {  # by the axes: of the world, and of the body
 }
 
 
+def other_convention(axes: str) -> str:
+    """Returns the convention of axes that is not the given one."""
+    return "ned" if axes == "enu" else "enu"
+
+
 def with_axes_of_files(mapping: "LogMapping", files: Sequence[Path]) -> "LogMapping":
     """Returns the mapping, with the axes of this kind of files where it says none.
 

@@ -477,17 +477,17 @@ def _stream_warnings(
         if count:
             warnings.append(f"{count} {kind}{of_topic}")
     if len(clock.time) < 2:
-        held = "a single stamp" if len(clock.time) else "no stamp"
+        stamps = "a single stamp" if len(clock.time) else "no stamp"
         warnings.append(
-            f"the time{of_topic} holds {held}: values stand over their rows"
+            f"the time{of_topic} holds {stamps}: values stand over their rows"
         )
     if steps.gaps:
         warnings.append(
             f"{len(steps.gaps)} gaps{of_topic}, up to {steps.longest_gap:.3g} s"
         )
     if steps.jitter > JITTER:
-        share = f"{steps.jitter:.0%} of the time step"
-        warnings.append(f"stamps{of_topic} jitter by {share}: state a rate")
+        jitter = f"{steps.jitter:.0%} of the time step"
+        warnings.append(f"stamps{of_topic} jitter by {jitter}: state a rate")
     return warnings
 
 

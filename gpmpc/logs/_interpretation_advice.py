@@ -8,7 +8,7 @@ import numpy as np
 from gpmpc._dynamics import Array
 from gpmpc.logs._attitude_interpretations import AttitudeInterpretation
 from gpmpc.logs._axis_fits import AxisFit
-from gpmpc.logs._frames import FRD, NAMES, NED, Claim
+from gpmpc.logs._frames import FRD, NAMES, NED, Claim, other_convention
 from gpmpc.logs._interpretations import (
     ANGLES,
     LENGTHS,
@@ -44,13 +44,13 @@ def mistakes_of(best: Interpretation, search: InterpretationSearch) -> list[str]
     """
     claim = search.claim
     if search.is_other_frame(best):
-        other = "ned" if claim.default_axes == "enu" else "enu"
-        world, body = NAMES[claim.default_axes]
-        other_world, other_body = NAMES[other]
+        axes = other_convention(claim.default_axes)
+        claimed_world, claimed_body = NAMES[claim.default_axes]
+        world, body = NAMES[axes]
         return [
-            f"gravity says that all states are in {other_world} axes of the world and "
-            f"{other_body} axes of the body, not in {world} and {body}: "
-            f"write frame: {other}"
+            f"gravity says that all states are in {world} axes of the world and "
+            f"{body} axes of the body, not in {claimed_world} and {claimed_body}: "
+            f"write frame: {axes}"
         ]
     _, of_rate = search.relations.claimed_relations
     sentences = [best.attitude.advice] if best.attitude.advice else []
@@ -134,12 +134,12 @@ def _fit_mistakes(
 def _axes_mistake(claim: Claim, signal: Signal, frame: str, matrix: Array) -> str:
     """Describes the axes of a vector that are a matrix (3, 3) times the true ones."""
     claimed = claim.axes[signal.name]
-    other = "ned" if claimed == "enu" else "enu"
+    axes = other_convention(claimed)
     place = 0 if frame == "world" else 1
     if np.array_equal(matrix, NED if frame == "world" else FRD):
         return (
-            f"{signal.name} is in {NAMES[other][place]} axes, not in "
-            f"{NAMES[claimed][place]}: write axes: {other} for {signal.name}"
+            f"{signal.name} is in {NAMES[axes][place]} axes, not in "
+            f"{NAMES[claimed][place]}: write axes: {axes} for {signal.name}"
         )
     to_enu = claim.to_enu(signal, frame)
     inverse = (to_enu @ matrix @ to_enu).T  # from the file's axes to the true ones

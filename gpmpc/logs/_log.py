@@ -53,7 +53,7 @@ class LogRun:
         return list(zip(self.begins, (*self.begins[1:], len(self)), strict=True))
 
     def starts(self, past: int, ahead: int, stride: int = 1) -> np.ndarray:
-        """Lists rows with ``past`` rows before and ``ahead`` behind in their piece."""
+        """Lists rows with ``past`` rows before and ``ahead`` after in their piece."""
         return np.concatenate(
             [np.arange(begin + past, end - ahead, stride) for begin, end in self.pieces]
         ).astype(int)
@@ -70,7 +70,11 @@ class LogRun:
         )
 
     def part(self, begin: int, end: int, name: str) -> "LogRun":
-        """Returns the rows from ``begin`` to before ``end`` as a run of its own."""
+        """Returns the rows from ``begin`` to before ``end`` as a run of its own.
+
+        It keeps in ``origin`` of which run it is a part: by that, rows of folds and of
+        both sides of a split are found again in the whole log.
+        """
         rows = slice(begin, end)
         return LogRun(
             name=f"{self.name}, {name}",
@@ -188,13 +192,14 @@ class Log:
         check_number("share", share, above=0)
         if share >= 1:
             raise SettingError("share", f"must be below 1; got {share:g}")
-        first = []
-        last = []
+        first_parts = []
+        last_parts = []
         for run in self.runs:
             cut = min(max(round(share * len(run)), 1), len(run) - 1)
-            first.append(run.part(0, cut, "first part"))
-            last.append(run.part(cut, len(run), "last part"))
-        return replace(self, runs=tuple(first)), replace(self, runs=tuple(last))
+            first_parts.append(run.part(0, cut, "first part"))
+            last_parts.append(run.part(cut, len(run), "last part"))
+        first = replace(self, runs=tuple(first_parts))
+        return first, replace(self, runs=tuple(last_parts))
 
     def transitions(self) -> Transitions:
         """Returns all transitions between rows inside a piece, as data of GPs."""
@@ -237,23 +242,23 @@ class Log:
         if most is not None:
             check_number("most", most, least=1, whole=True)
             stride = self._stride_for(most, rows=past + ahead)
-        parts = [run.windows(past, ahead, stride) for run in self.runs]
-        if not sum(len(part.times) for part in parts):
+        windows = [run.windows(past, ahead, stride) for run in self.runs]
+        if not sum(len(own.times) for own in windows):
             raise DataError(
                 f"windows of {past + ahead + 1} rows need a piece as long; the longest "
                 f"has {self.longest_piece}"
             )
-        runs = [np.full(len(part.times), number) for number, part in enumerate(parts)]
+        runs = [np.full(len(own.times), number) for number, own in enumerate(windows)]
         return Windows(
             space=self.space,
             time_step=self.time_step,
             past=past,
             stride=stride,
-            states=np.concatenate([part.states for part in parts]),
-            inputs=np.concatenate([part.inputs for part in parts]),
-            context=np.concatenate([part.context for part in parts]),
+            states=np.concatenate([own.states for own in windows]),
+            inputs=np.concatenate([own.inputs for own in windows]),
+            context=np.concatenate([own.context for own in windows]),
             runs=np.concatenate(runs),
-            times=np.concatenate([part.times for part in parts]),
+            times=np.concatenate([own.times for own in windows]),
         )
 
     def _stride_for(self, most: int, rows: int) -> int:

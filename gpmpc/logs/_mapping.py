@@ -191,7 +191,11 @@ class Signal:
 
     @property
     def group(self) -> StateGroup:
-        """The entries of a state that it becomes."""
+        """The entries of a state that it becomes, after ``read_signal``.
+
+        Angles of an attitude have become a quaternion there, which has no unit;
+        ``factors`` are of the columns before.
+        """
         if self.is_attitude:
             entries = tuple(f"{self.name}_{axis}" for axis in "xyzw")
             return StateGroup(

@@ -75,25 +75,25 @@ def cut_motion_windows(
     lag_stride = max(round(LAG_STEP / step), 1)
     last_lag = int(LONGEST_LAG / step) // lag_stride
     lags = lag_stride * np.arange(-last_lag, last_lag + 1)
-    parts = [
+    windows_by_run = [
         _windows_of_run(run, rows[::stride], lags, half, half_wide, claim)
         for run, rows in zip(runs, middles, strict=True)
     ]
-    means = _join([part.means for part in parts])
-    later_means = _join([part.later_means for part in parts])
+    means = _join([own.means for own in windows_by_run])
+    later_means = _join([own.later_means for own in windows_by_run])
     duration = 2 * half * step
     return MotionWindows(
-        moves=_join([part.steps for part in parts]) / duration,
-        attitudes=_join([part.attitudes for part in parts]),
+        moves=_join([own.steps for own in windows_by_run]) / duration,
+        attitudes=_join([own.attitudes for own in windows_by_run]),
         velocities=means[:, 0:3],
         rates=means[:, 3:6],
         duration=duration,
         lags=np.asarray(lags * step, dtype=float),
         later_velocities=later_means[..., 0:3],
         later_rates=later_means[..., 3:6],
-        wide_attitudes=_join([part.wide_attitudes for part in parts]),
-        wide_positions=_join([part.wide_positions for part in parts]),
-        wide_velocities=_join([part.wide_velocities for part in parts]),
+        wide_attitudes=_join([own.wide_attitudes for own in windows_by_run]),
+        wide_positions=_join([own.wide_positions for own in windows_by_run]),
+        wide_velocities=_join([own.wide_velocities for own in windows_by_run]),
         wide_duration=2 * half_wide * step,
     )
 

@@ -81,8 +81,8 @@ def _take_memory(path: Path, tables: dict[str, _DeclaredArray]) -> None:
         bytes_per_cell = NUMBER_BYTES
         if not array.is_number:
             bytes_per_cell = TEXT_BYTES + 2 * array.dtype.itemsize
-        what = f"array {name!r} of shape {array.shape}"
-        budget.take(math.prod(array.shape) * bytes_per_cell, what)
+        label = f"array {name!r} of shape {array.shape}"
+        budget.take(math.prod(array.shape) * bytes_per_cell, label)
 
 
 def _declared_arrays(path: Path) -> dict[str, _DeclaredArray]:

@@ -91,13 +91,13 @@ def _mean_residuals(
     nominal = model.nominal_outputs(states, inputs, context)
     residuals = outputs - nominal
     features = kinematics.features(states, inputs, context)
-    seen = features
+    points = features
     if model.weights.size:
         regressors = _regressors(model, windows, features, residuals)
         residuals = residuals - regressors @ model.weights.T
         if sees_memory:
-            seen = regressors[..., :-1]
-    return seen[:, rows // 2], residuals.mean(axis=1)
+            points = regressors[..., :-1]
+    return points[:, rows // 2], residuals.mean(axis=1)
 
 
 def _regressors(

@@ -66,11 +66,13 @@ def read_log(
     findings: list[Finding] = []
     tables = _read_run_tables(paths, mapping, partial, findings)
     step = find_time_step(tables, paths[0], mapping, findings)
-    least = least_motion([mapping.split(table.values).states for table in tables], step)
+    rest_ranges = least_motion(
+        [mapping.split(table.values).states for table in tables], step
+    )
     runs = []
     for table in tables:
         run_findings = RunFindings(table.name, findings)
-        run = select_rows(table, step, least, mapping, run_findings)
+        run = select_rows(table, step, rest_ranges, mapping, run_findings)
         if run is not None:
             runs.append(run)
     _check_content(runs, paths, findings)

@@ -74,10 +74,10 @@ def grid_at_rate(
     resolution_in_steps = min(STAMP_RESOLUTION * rate, FINE_RESOLUTION)
     lengths = np.floor(steps + resolution_in_steps) + 1
     rows = float(lengths.sum())
-    what = f"{rows:.6g} rows of {columns} columns at a rate of {rate:g} Hz"
+    description = f"{rows:.6g} rows of {columns} columns at a rate of {rate:g} Hz"
     if (max_gap or 0.0) > JUMP:
-        what += f", with gaps of up to {max_gap:g} s (max_gap),"
-    budget.take(_memory(rows, columns), what)
+        description += f", with gaps of up to {max_gap:g} s (max_gap),"
+    budget.take(_memory(rows, columns), description)
 
     counts = lengths.astype(int)
     first_rows = np.r_[0, np.cumsum(lengths)[:-1]].astype(int)
@@ -162,7 +162,7 @@ def intersect_pieces(pieces: Array, others: Array) -> Array:
 
 def count_rows_alone(time: Array, pieces: Array, common: Array) -> int:
     """Counts the rows of a topic in pieces (P, 2) of which nothing is in common."""
-    # the first common piece that ends behind the begin of each
+    # the first common piece that ends after the begin of each
     candidates = np.searchsorted(common[:, 1], pieces[:, 0])
     nearest = common[np.minimum(candidates, len(common) - 1)]
     is_alone = (nearest[:, 1] < pieces[:, 0]) | (nearest[:, 0] > pieces[:, 1])

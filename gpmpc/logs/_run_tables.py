@@ -41,7 +41,7 @@ class RunTable(NamedTuple):
     name: str
     time: Array  # (K,) [s]
     values: Array  # states, inputs and context (K, n + m + c)
-    outside: np.ndarray  # (K,) rows that the mapping leaves out
+    outside_keep: np.ndarray  # (K,) rows outside the ranges of the mapping's ``keep``
     breaks: np.ndarray  # (K,) rows before which time ran backwards, or jumped
 
 
@@ -89,7 +89,7 @@ def tabulate(
         name=findings.run,
         time=grid.time,
         values=np.concatenate(columns, axis=1),
-        outside=_rows_outside(where, topics, grid, mapping),
+        outside_keep=_rows_outside(where, topics, grid, mapping),
         breaks=grid.breaks,
     )
 
@@ -204,7 +204,7 @@ def _make_grid(
     """Makes the times of a run's rows: those of its one table, or at a rate."""
     columns = sum(len(signal.group.entries) for signal in mapping.signals)
     if mapping.rate is None:
-        (topic,) = topics.values()
+        (topic,) = topics.values()  # of several, the mapping would ask for a rate
         return grid_of_rows(topic.stamps, columns, mapping.max_gap, budget)
     stamps = {name: topic.stamps for name, topic in topics.items()}
     pieces = common_pieces(stamps, mapping.max_gap, where, findings)
@@ -251,13 +251,14 @@ def _note_own_rate(
     own_step = float(np.median(steps))
     if own_step * mapping.rate < USUAL_GAP or signal.rule == "hold":
         return
-    share = 1 - 1 / (own_step * mapping.rate)
+    interpolated = 1 - 1 / (own_step * mapping.rate)  # of the rows
     text = (
-        f"{signal.name} is measured at {1 / own_step:.3g} Hz: about {share:.0%} of its "
-        "rows lie between two measurements, and hold something of the later one, so "
-        "predictions look better than they are; state a lower rate"
+        f"{signal.name} is measured at {1 / own_step:.3g} Hz: about "
+        f"{interpolated:.0%} of its rows lie between two measurements, and hold "
+        "something of the later one, so predictions look better than they are; state "
+        "a lower rate"
     )
-    findings.add("interpolated", int(share * len(grid.time)), text)
+    findings.add("interpolated", int(interpolated * len(grid.time)), text)
 
 
 def _rows_outside(

@@ -23,8 +23,8 @@ from gpmpc.logs._time_step import LONG_STEP, SHORT_STEP
 REST_TIME = 0.5  # [s] for which nothing moves at rest
 REST_SHARE = 0.1  # of a state's usual motion that counts as no movement
 USUAL_MOTION = 0.9  # quantile of the ranges within ``REST_TIME``
-# of the rows; beyond, a signal has another rate than its table. Half of them repeat at
-# half the rate; clocks that drift make it a little less.
+# Share of the rows; beyond, a signal has another rate than its table. At half the rate
+# half of them repeat, or a little less where the two clocks drift: .45 is below both.
 MOST_HELD = 0.45
 MOST_MISSING = 0.5  # of the rows within ``REST_TIME``: of fewer a range says nothing
 
@@ -57,7 +57,7 @@ def least_motion(states: Sequence[Array], step: float) -> Array:
 def select_rows(
     table: RunTable,
     step: float,
-    least: Array,
+    rest_ranges: Array,
     mapping: LogMapping,
     findings: RunFindings,
 ) -> LogRun | None:
@@ -66,7 +66,7 @@ def select_rows(
     Args:
         table: Of the run.
         step: Time step of the log [s].
-        least: See ``least_motion`` (n,).
+        rest_ranges: Up to which states do not move (n,); see ``least_motion``.
         mapping: Says what is left out.
         findings: Of the run, which takes what is left out.
 
@@ -78,26 +78,26 @@ def select_rows(
     """
     values = mapping.split(table.values)
     rows = _RowSelection(len(table.time), findings)
-    rows.leave_out(table.outside, "outside of keep", "outside the ranges of keep")
+    rows.leave_out(table.outside_keep, "outside of keep", "outside the ranges of keep")
     if mapping.rest == "drop":
-        at_rest = _at_rest(values.states, values.inputs, least, step)
+        at_rest = _at_rest(values.states, values.inputs, rest_ranges, step)
         text = "where nothing moves (rest: use keeps them)"
         rows.leave_out(at_rest, "at rest", text)
     is_missing = np.asarray(np.isnan(table.values).any(axis=1))
     rows.leave_out(is_missing, "missing value", "in a gap or without a value")
     _leave_out_held_values(rows, table.name, values.states, mapping)
-    motion = _ranges_of_rest_time(values.states, step) > least
+    motion = _ranges_of_rest_time(values.states, step) > rest_ranges
     _note_held_sensors(values.states, motion, mapping, findings)
-    used = np.flatnonzero(rows.usable)
-    if len(used) < 2:
+    usable_rows = np.flatnonzero(rows.usable)
+    if len(usable_rows) < 2:
         text = "no row can be used: the run is left out"
         findings.add("nothing left", len(table.time), text)
         return None
-    ends_piece = _find_ends_of_pieces(table, used, step, mapping, findings)
-    values = mapping.split(table.values[used])
+    ends_piece = _find_ends_of_pieces(table, usable_rows, step, mapping, findings)
+    values = mapping.split(table.values[usable_rows])
     return LogRun(
         name=table.name,
-        time=table.time[used],
+        time=table.time[usable_rows],
         states=values.states,
         inputs=values.inputs,
         context=values.context,
@@ -134,20 +134,20 @@ def _leave_out_held_values(
         if len(signal.columns) < 2:  # a single one may repeat by its resolution
             continue
         repeats = (states[1:, columns] == states[:-1, columns]).all(axis=1)
-        held = np.r_[False, repeats] & usable
-        if held.sum() >= max(count - 1, 1):
+        is_repeated = np.r_[False, repeats] & usable
+        if is_repeated.sum() >= max(count - 1, 1):
             raise DataError(
                 f"run {run}: {signal.name} never changes: its sensor was silent; "
                 "leave it out, or held: use"
             )
-        if held.sum() > MOST_HELD * max(count, 1):
-            changes = (usable & ~held).sum()
+        if is_repeated.sum() > MOST_HELD * max(count, 1):
+            changes = (usable & ~is_repeated).sum()
             raise DataError(
                 f"run {run}: {signal.name} changes in {changes} of {count} rows only: "
                 "its own rate is lower; state a lower rate, or held: use"
             )
         text = f"where {signal.name} repeats the row before"
-        rows.leave_out(held, "held value", text)
+        rows.leave_out(is_repeated, "held value", text)
 
 
 def _note_held_sensors(
@@ -183,30 +183,30 @@ def _note_held_sensors(
 
 def _find_ends_of_pieces(
     table: RunTable,
-    used: np.ndarray,
+    rows: np.ndarray,
     step: float,
     mapping: LogMapping,
     findings: RunFindings,
 ) -> np.ndarray:
-    """Finds the used rows with which a piece ends, and notes gaps.
+    """Finds the usable rows with which a piece ends, and notes gaps.
 
     Args:
         table: Of the run.
-        used: Rows (U,) that are used.
+        rows: Usable ones (U,).
         step: Time step of the log [s].
         mapping: Says how long a gap may be.
         findings: Takes the gaps between neighbouring rows.
 
     Returns:
-        Whether a piece ends with each used row but the last (U - 1,).
+        Whether a piece ends with each of them but the last (U - 1,).
     """
     longest = LONG_STEP * step
     if mapping.max_gap and not mapping.rate:  # rows that follow are one step apart
         longest = min(longest, mapping.max_gap)
-    steps = np.diff(table.time[used])
+    steps = np.diff(table.time[rows])
     is_uneven = (steps > longest) | (steps < SHORT_STEP * step)
-    are_apart = np.diff(used) > 1
-    is_before_break = table.breaks[used[1:]]
+    are_apart = np.diff(rows) > 1
+    is_before_break = table.breaks[rows[1:]]
     is_jump = is_before_break & (steps > JUMP)  # which has its own finding
     uneven = steps[is_uneven & ~are_apart & ~is_jump]
     _note_gaps(uneven, step, mapping, findings)
@@ -239,15 +239,17 @@ def _ranges_of_rest_time(states: Array, step: float) -> Array:
     return _range_within(states, size)
 
 
-def _at_rest(states: Array, inputs: Array, least: Array, step: float) -> np.ndarray:
+def _at_rest(
+    states: Array, inputs: Array, rest_ranges: Array, step: float
+) -> np.ndarray:
     """Finds rows (K,) of stretches in which inputs stay and no state moves.
 
-    ``least`` holds the ranges (n,) up to which states do not; see ``least_motion``.
+    ``rest_ranges`` are those (n,) up to which states do not; see ``least_motion``.
     """
     size = max(round(REST_TIME / step), 3)
     if len(states) < size or not inputs.shape[1]:
         return np.zeros(len(states), dtype=bool)
-    limit = np.concatenate([least, np.zeros(inputs.shape[1])])
+    limit = np.concatenate([rest_ranges, np.zeros(inputs.shape[1])])
     values = np.concatenate([states, inputs], axis=1)
     is_still = (_range_within(values, size) <= limit).all(axis=1)
     # A maximum takes the same time for any size, a dilation by the rows of one second

@@ -187,8 +187,8 @@ class LogModel:
         if self.weights.size:
             y += regressors @ np.swapaxes(self.weights, -1, -2)
         for gp in self.gps:
-            seen = regressors[..., :-1] if gp.sees_memory else features
-            y[..., list(gp.outputs)] += gp.mean(seen)
+            points = regressors[..., :-1] if gp.sees_memory else features
+            y[..., list(gp.outputs)] += gp.mean(points)
         return y
 
     def features(self, states: Array, inputs: Array, context: Array) -> Array:
@@ -271,11 +271,12 @@ class LogModel:
         states = now.states
         context = np.broadcast_to(context, (*states.shape[:-1], context.shape[-1]))
         learned = self.learned_outputs(states, now.inputs, context, now.memory)
-        learned = learned + disturbance
-        outputs = self.nominal_outputs(states, now.inputs, context, theta) + learned
+        beyond_nominal = learned + disturbance
+        nominal = self.nominal_outputs(states, now.inputs, context, theta)
+        outputs = nominal + beyond_nominal
         after = self.kinematics.step(states, outputs, time_step)
-        learned = np.broadcast_to(learned, outputs.shape)
-        return self._carry_on(now, after, context, learned)
+        beyond_nominal = np.broadcast_to(beyond_nominal, outputs.shape)
+        return self._carry_on(now, after, context, beyond_nominal)
 
     def follow(
         self,
@@ -345,7 +346,7 @@ class LogModel:
         )
 
     def _carry_on(
-        self, now: "_ActingState", after: Array, context: Array, learned: Array
+        self, now: "_ActingState", after: Array, context: Array, beyond_nominal: Array
     ) -> Array:
         """Returns next states with all that is carried on.
 
@@ -353,12 +354,12 @@ class LogModel:
             now: The step.
             after: Next states (..., n).
             context: (..., c).
-            learned: What the nominal part left of the outputs (..., o).
+            beyond_nominal: What the nominal part left of the outputs (..., o).
         """
         memory = now.memory
         if not self.memory.empty:
             features = self.features(now.states, now.inputs, context)
-            memory = self.memory.step(memory, features, learned)
+            memory = self.memory.step(memory, features, beyond_nominal)
         parts = [after, now.next_lagged, now.next_pending, memory]
         return np.concatenate(parts, axis=-1)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pandas
 import pytest
 
-from gpmpc.cli._learn import _FileMemory, _fingerprint, _split
+from gpmpc.cli._learn import _fingerprint_of_call, _split, _StageResults
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.logs import Log, LogMapping, inspect_log
 from gpmpc.logs._log import LogRun
@@ -291,18 +291,18 @@ def test_outcomes_are_of_the_times_and_pieces_of_the_rows():
         Log(mapping, 0.2, (replace(run, time=2 * run.time),)),
         Log(mapping, 0.1, (replace(run, begins=(0, 10)),)),
     ]
-    names = [_fingerprint(arguments, log) for log in (*logs, logs[0])]
+    names = [_fingerprint_of_call(arguments, log) for log in (*logs, logs[0])]
     assert names[0] == names[3]
     assert len({*names}) == 3
 
 
 def test_stage_results_are_reused_or_a_line_says_why_not(tmp_path):
     path = tmp_path / "progress.json"
-    memory = _FileMemory(path, "name")
+    memory = _StageResults(path, "name")
     assert memory == {}
     assert memory.begun_anew == ""
     memory["fit"] = [1.5]
-    again = _FileMemory(path, "name")
+    again = _StageResults(path, "name")
     assert again == {"fit": [1.5]}
     assert again.begun_anew == ""
     stored = json.loads(path.read_text())
@@ -317,6 +317,6 @@ def test_stage_results_are_reused_or_a_line_says_why_not(tmp_path):
         (json.dumps(stored | {"stages": 3}), "is not whole"),
     ):
         path.write_text(content)
-        memory = _FileMemory(path, "name")
+        memory = _StageResults(path, "name")
         assert memory == {}
         assert memory.begun_anew == f"{path}: {reason}; all is learned anew"
