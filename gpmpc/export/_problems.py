@@ -8,7 +8,7 @@ import numpy as np
 from gpmpc.export._filter import Estimator, filter_definitions
 from gpmpc.export._functions import FunctionWriter
 from gpmpc.export._text import Numbers, comment, integers
-from gpmpc.mpc import GPMPC
+from gpmpc.mpc import GPMPC, _elastic
 
 Array = np.ndarray
 
@@ -33,6 +33,13 @@ _COMMENTS = {
     "GPMPC_PENALIZED": "what R weighs: 0 inputs, 1 deviations, 2 increments",
     "GPMPC_TOLERANCE": "of a solution, as a share of its size",
     "GPMPC_LARGEST_WEIGHT": "of the cost",
+    "GPMPC_WORTH": "of elastic rows, in costs of a plan without them",
+    "GPMPC_SHARE": "of such a cost that a plan may cost more",
+    "GPMPC_TRIALS": "prices of elastic rows that are tried",
+    "GPMPC_NO_PRICE": "of an elastic row that does not count, over its exact one",
+    "GPMPC_LOWEST": "price that is tried, over the safe one",
+    "GPMPC_NO_MOMENT": "share of its terms below which a sum is rounding",
+    "GPMPC_NO_WEIGHT": "share of the largest weight below which there is none",
     "GPMPC_DISTURBANCE_GAIN": "of the estimate of a constant error",
     "GPMPC_STATE_WEIGHTS": "weights Q: one, or one for each stage",
     "GPMPC_INPUT_WEIGHTS": "weights R, likewise",
@@ -135,6 +142,8 @@ def definitions(
         "GPMPC_DISTURBANCE_GAIN": f"(gpmpc_real){float(gain)!r}",
     }
     values |= {f"GPMPC_{name}": str(size) for name, size in model_sizes.items()}
+    if constraints.any_elastic:
+        values |= _elastic_numbers()
     values |= filter_definitions(estimator, prediction.state_dim)
     flags = _flags(controller, numbers, on_failure)
     flags["GPMPC_FILTERS"] = estimator is not None
@@ -142,6 +151,20 @@ def definitions(
     conditions = {name: int(flag) for name, flag in flags.items()}
     conditions["GPMPC_KERNELS"] = model_sizes["KERNELS"]
     return Definitions(values, _COMMENTS, conditions)
+
+
+def _elastic_numbers() -> dict[str, str]:
+    """Returns the numbers of the rule that prices elastic rows."""
+    numbers = {
+        "GPMPC_WORTH": _elastic.WORTH,
+        "GPMPC_SHARE": _elastic.SHARE,
+        "GPMPC_NO_PRICE": _elastic.NO_PRICE,
+        "GPMPC_LOWEST": _elastic.LOWEST,
+        "GPMPC_NO_MOMENT": _elastic.NO_MOMENT,
+        "GPMPC_NO_WEIGHT": _elastic.NO_WEIGHT,
+    }
+    values = {name: f"(gpmpc_real){number!r}" for name, number in numbers.items()}
+    return {**values, "GPMPC_TRIALS": str(_elastic.TRIALS)}
 
 
 def _flags(controller: GPMPC, numbers: Numbers, on_failure: str) -> dict[str, bool]:

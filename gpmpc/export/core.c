@@ -218,10 +218,10 @@ static const real *input_weight(int k)
 /* Index of the stage model of stage k: of H, or the one that is held. */
 static int stage_of(int k) { return GPMPC_STAGES > 1 ? k : 0; }
 
-/* An input within its box at stage k. */
+/* An input within its box at stage k; one that is no number stays so. */
 static real within_box(real u, int k, int i)
 {
-    return smaller(larger(u, input_lower[k * m + i]), input_upper[k * m + i]);
+    return smaller(input_upper[k * m + i], larger(input_lower[k * m + i], u));
 }
 
 /* An input within its rates from the one before it, where there are any. */
@@ -229,8 +229,8 @@ static real within_rates(real u, real last, int k, int i)
 {
     if (!GPMPC_HAS_RATES)
         return u;
-    return smaller(larger(u, last + rate_lower[k * m + i]),
-                   last + rate_upper[k * m + i]);
+    return smaller(last + rate_upper[k * m + i],
+                   larger(last + rate_lower[k * m + i], u));
 }
 
 /* Entry i of what the last plan means for stage k: its mean one step later, the last
@@ -704,6 +704,8 @@ static real largest_violation(const gpmpc_problem *problem)
 }
 #endif
 
+static int is_hard(int e) { return row_prices[e] > LARGEST; }
+
 /* Whether the plan misses no hard row of the states by more than a limit. */
 static int keeps_hard_rows(const gpmpc_problem *problem, real limit)
 {
@@ -712,7 +714,7 @@ static int keeps_hard_rows(const gpmpc_problem *problem, real limit)
         for (e = 0; e < r; e++) {
             real miss =
                 row_miss(problem, k, e, problem->states[k + 1], problem->inputs[k]);
-            if (row_prices[e] > LARGEST && !(miss <= limit))
+            if (is_hard(e) && !(miss <= limit))
                 return 0;
         }
     return 1;
@@ -1113,7 +1115,8 @@ static void condense_with_feedback(gpmpc_controller *controller)
 }
 
 /* Makes the quadratic program, in the coordinates that suit it: where A grows over the
-   horizon, P in the inputs spans more digits than a number has. */
+   horizon, P in the inputs spans more digits than a number has. Roll-outs follow the
+   program's feedback only where doubles need these coordinates, too. */
 static void condense(gpmpc_controller *controller)
 {
     gpmpc_problem *problem = &controller->problem;
@@ -1137,6 +1140,7 @@ static void condense(gpmpc_controller *controller)
             int last = N - m + i;
             growth += program->P[here][here] / program->P[last][last];
         }
+    problem->is_unstable = !(growth <= UNSTABLE_GROWTH);
     if (growth <= LARGEST_GROWTH)
         write_gradient(controller);
     else
@@ -1168,8 +1172,8 @@ static void follow(gpmpc_controller *controller, real *states, real *inputs)
                 k > 0 ? inputs[(k - 1) * m + i] : problem->previous_input[i];
             real u = inputs[k * m + i];
             for (j = 0; j < n; j++) {
-                real gain = problem->has_feedback ? problem->feedback[k][i][j]
-                                                  : -problem->gains[k][i][j];
+                real gain = problem->is_unstable ? problem->feedback[k][i][j]
+                                                 : -problem->gains[k][i][j];
                 u += gain * (state[j] - target[j]);
             }
             inputs[k * m + i] = within_box(within_rates(u, last, k, i), k, i);
@@ -1179,6 +1183,44 @@ static void follow(gpmpc_controller *controller, real *states, real *inputs)
         for (i = 0; i < n && GPMPC_ESTIMATES; i++)
             next[i] += controller->disturbance[i];
     }
+}
+#endif
+
+#if GPMPC_ROLLS_OUT || !GPMPC_IS_FLOAT
+/* Writes by how much a plan misses its rows (H, r), zero inside. */
+static void write_misses_of_plan(const gpmpc_problem *problem, const real *states,
+                                 const real *inputs, real *misses)
+{
+    int k, e;
+    for (k = 0; k < H; k++)
+        for (e = 0; e < r; e++)
+            misses[k * r + e] = larger(
+                0, row_miss(problem, k, e, states + (k + 1) * n, inputs + k * m));
+}
+#endif
+
+#if GPMPC_ELASTIC || (GPMPC_IS_FLOAT && !GPMPC_ROLLS_OUT)
+/* Writes by how much the plan of a solution misses its rows (H, r), zero inside. */
+static void write_misses(const gpmpc_problem *problem, const gpmpc_solution *solution,
+                         real *misses)
+{
+#if GPMPC_IS_FLOAT
+    Rollout plan;
+    int k, e;
+    roll_out(problem, solution->x, solution->x_low, &plan);
+    for (k = 0; k < H; k++)
+        for (e = 0; e < r; e++) {
+            Pair value = exact_row(problem, &plan, k, e);
+            real above = (value.high - problem->row_upper[k][e]) + value.low;
+            real below = (problem->row_lower[k][e] - value.high) - value.low;
+            misses[k * r + e] = larger(0, larger(above, below));
+        }
+#else
+    real inputs[GPMPC_SIZE];
+    real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
+    expand(problem, solution->x, inputs, states);
+    write_misses_of_plan(problem, states, inputs, misses);
+#endif
 }
 #endif
 
@@ -1221,144 +1263,183 @@ static real cost_of_plan(const gpmpc_problem *problem, const real *states,
     return total;
 }
 
-/* Writes by how much the plan of a solution misses its rows (H, r); negative inside. */
-static void write_misses(const gpmpc_problem *problem, const gpmpc_solution *solution,
-                         real *misses)
+/* The elastic rows that a program misses under their exact prices. */
+typedef struct {
+    int count;
+    int gives_way[r];
+    real lengths[r];    /* what each rises per unit of distance */
+    int are_kept_again; /* early on the horizon rather than late */
+} elastic_rows;
+
+/* The square of what row e rises at stage k per unit of distance. */
+static real squared_length(const gpmpc_problem *problem, int k, int e)
 {
-    int k, e;
-#if GPMPC_IS_FLOAT
-    Rollout plan;
-    roll_out(problem, solution->x, solution->x_low, &plan);
-    for (k = 0; k < H; k++)
-        for (e = 0; e < r; e++) {
-            Pair value = exact_row(problem, &plan, k, e);
-            misses[k * r + e] =
-                larger((value.high - problem->row_upper[k][e]) + value.low,
-                       (problem->row_lower[k][e] - value.high) - value.low);
-        }
-#else
-    real inputs[GPMPC_SIZE];
-    real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
-    expand(problem, solution->x, inputs, states);
-    for (k = 0; k < H; k++)
-        for (e = 0; e < r; e++)
-            misses[k * r + e] =
-                row_miss(problem, k, e, states + (k + 1) * n, inputs + k * m);
+    const real *by_state = ROW_BY_STATE(problem, k, e);
+    real square = dot(by_state, by_state, n);
+#if GPMPC_SMOOTH
+    square += dot(problem->D[k][e], problem->D[k][e], m);
 #endif
+    return square > 0 ? square : 1;
 }
 
-/* Finds the elastic rows that are missed, which give way; returns how many. */
-static int find_rows_that_give_way(const real *misses, int *gives_way)
+/* Returns the length of a row: the mean over the stages, by what is missed there,
+   exactly the first where all stages have the same. */
+static real row_length(const gpmpc_problem *problem, const real *misses, int e)
 {
-    int count = 0;
-    int k, e;
-    for (e = 0; e < r; e++) {
-        gives_way[e] = 0;
-        for (k = 0; k < H; k++)
-            if (row_is_elastic[e] && misses[k * r + e] > KEPT)
-                gives_way[e] = 1;
-        count += gives_way[e];
+    real first = SQRT(squared_length(problem, 0, e));
+    real beyond_first = 0;
+    real missed = 0;
+    int k;
+    for (k = 0; k < H; k++) {
+        real length = SQRT(squared_length(problem, k, e));
+        beyond_first += misses[k * r + e] * (length - first);
+        missed += misses[k * r + e];
     }
-    return count;
+    return first + beyond_first / missed;
 }
-
-#define NO_MOMENT REAL(1e-6) /* share of its terms below which a sum is rounding */
 
 /* Whether rows that give way are missed early on the horizon rather than late. */
-static int are_kept_again(const real *misses, const int *gives_way)
+static int are_kept_again(const real *misses, const elastic_rows *rows)
 {
     real moment = 0;
     real size = 0; /* of its terms */
     int k, e;
-    for (k = 0; k < H; k++)
+    for (k = 0; k < H; k++) {
+        real distance = 0;
+        real term;
         for (e = 0; e < r; e++)
-            if (gives_way[e]) {
-                real term = (k - REAL(0.5) * (H - 1)) * larger(0, misses[k * r + e]);
-                moment += term;
-                size += absolute(term);
-            }
-    return moment <= NO_MOMENT * size;
+            if (rows->gives_way[e])
+                distance += misses[k * r + e] / rows->lengths[e];
+        term = (k - REAL(0.5) * (H - 1)) * distance;
+        moment += term;
+        size += absolute(term);
+    }
+    return moment <= GPMPC_NO_MOMENT * size;
 }
 
-/* Price of a row that does not count: it keeps its place among the others. */
-#define NO_PRICE REAL(1e-9)
+/* Finds the elastic rows that are missed (H, r), which give way. */
+static void find_elastic_rows(const gpmpc_problem *problem, const real *misses,
+                              elastic_rows *rows)
+{
+    int k, e;
+    rows->count = 0;
+    for (e = 0; e < r; e++) {
+        rows->gives_way[e] = 0;
+        rows->lengths[e] = 1;
+        for (k = 0; k < H && row_is_elastic[e]; k++)
+            if (misses[k * r + e] / SQRT(squared_length(problem, k, e)) > KEPT)
+                rows->gives_way[e] = 1;
+        if (rows->gives_way[e])
+            rows->lengths[e] = row_length(problem, misses, e);
+        rows->count += rows->gives_way[e];
+    }
+    rows->are_kept_again = are_kept_again(misses, rows);
+}
 
-/* What elastic rows that cannot be kept may cost. */
+/* What elastic rows that cannot be kept may cost; prices are of distances. */
 typedef struct {
-    real least_price;  /* under which no plan outweighs the cost */
-    real lowest_price; /* of those that are tried for a plan that goes on */
-    real extra_cost;   /* of such a plan, beside that without them */
+    real safe_price;            /* under which no plan outweighs the cost */
+    real lowest_trial_price;    /* of those that are tried for a plan that goes on */
+    real exact_price;           /* the highest of the rows */
+    real affordable_extra_cost; /* of such a plan, beside that without them */
 } elastic_limits;
 
-/* Returns the limits of the price of elastic rows (gpmpc/mpc/_elastic.py): with cost J0
-   and violations V0 of the plan without them,
-   least price = 2 (J + ..) / V0,   J0 <= J <= 2 J0,   extra cost = (J0 + ..) / 10
-   where they are kept again, else lower prices are tried, too, for J0 / 10. */
+/* What it costs to be beside the reference by a miss of row e at stage k. */
+static real moving_cost(const gpmpc_problem *problem, int k, int e, real miss)
+{
+    const real *g = ROW_BY_STATE(problem, k, e);
+    const real *Q = running_weight(k);
+    real square = dot(g, g, n);
+    real move = miss / squared_length(problem, k, e); /* times the gradient */
+    real weight = 0;
+    real largest = 0;
+    int i;
+    for (i = 0; i < n; i++) {
+        weight += g[i] * dot(Q + i * n, g, n);
+        largest = larger(largest, Q[i * n + i]);
+    }
+    if (!(largest > 0))
+        largest = GPMPC_LARGEST_WEIGHT;
+    /* counts where the cost does not weigh the direction */
+    if (!(weight > GPMPC_NO_WEIGHT * largest * square))
+        weight = largest * square;
+#if GPMPC_SMOOTH
+    weight += largest * dot(problem->D[k][e], problem->D[k][e], m);
+#endif
+    return weight * move * move;
+}
+
+/* Returns a price of few digits: the exact one over quarters of powers of two. */
+static real rounded_price(real price, real exact_price)
+{
+    const real log_2 = REAL(0.6931471805599453);
+    real quarters = FLOOR(4 * LOG(price / exact_price) / log_2 + REAL(0.5));
+    return exact_price * POW(2, quarters / 4);
+}
+
+/* Returns the limits of the price of elastic rows (gpmpc/mpc/_elastic.py), from the
+   cost J0 and the misses (H, r) of the plan without them. */
 static elastic_limits limits_of_price(const gpmpc_problem *problem, const real *misses,
-                                      const int *gives_way, int kept_again,
-                                      real free_cost, real guess_cost)
+                                      const elastic_rows *rows,
+                                      real programmed_free_cost, real guess_cost)
 {
     elastic_limits limits;
-    real cost = smaller(larger(free_cost, guess_cost), 2 * free_cost);
-    real sum_of_misses = 0;
-    real beside = 0;
-    real price;
-    int k, e, i;
+    real cost = smaller(larger(programmed_free_cost, guess_cost),
+                        2 * programmed_free_cost);
+    real distance = 0;
+    real moving = 0;
+    real lowest_price;
+    int k, e;
+    limits.exact_price = 0;
+    for (e = 0; e < r; e++)
+        if (rows->gives_way[e])
+            limits.exact_price =
+                larger(limits.exact_price, row_prices[e] * rows->lengths[e]);
     for (k = 0; k < H; k++)
-        for (e = 0; e < r; e++) {
-            const real *g = ROW_BY_STATE(problem, k, e);
-            const real *Q = running_weight(k);
-            real miss = misses[k * r + e];
-            real weight = 0;
-            real largest = 0;
-            real square;
-            if (!gives_way[e] || !(miss > 0))
-                continue;
-            for (i = 0; i < n; i++) {
-                weight += g[i] * dot(Q + i * n, g, n);
-                largest = larger(largest, Q[i * n + i]);
+        for (e = 0; e < r; e++)
+            if (rows->gives_way[e] && misses[k * r + e] > 0) {
+                moving += moving_cost(problem, k, e, misses[k * r + e]);
+                distance += misses[k * r + e] / rows->lengths[e];
             }
-            if (!(largest > 0))
-                largest = GPMPC_LARGEST_WEIGHT;
-            square = dot(g, g, n);
-            /* counts where the cost does not weigh the direction */
-            if (!(weight > REAL(1e-12) * largest * square))
-                weight = largest * square;
-#if GPMPC_SMOOTH
-            {
-                const real *by_input = problem->D[k][e];
-                real input_square = dot(by_input, by_input, m);
-                weight += largest * input_square;
-                square += input_square;
-            }
-#endif
-            if (!(square > 0))
-                square = 1;
-            sum_of_misses += miss;
-            beside += weight / (square * square) * miss * miss;
-        }
-    cost += beside;
-    price = larger(2 * cost / larger(sum_of_misses, REAL(1e-12)), NO_PRICE);
-    /* of few digits: a quarter of a power of two */
-    price = POW(2, FLOOR(4 * LOG(price) / REAL(0.6931471805599453) + REAL(0.5)) / 4);
-    limits.least_price = price;
-    if (kept_again) {
-        limits.lowest_price = price;
-        limits.extra_cost = REAL(0.1) * (free_cost + beside);
+    lowest_price = GPMPC_NO_PRICE * limits.exact_price;
+    limits.safe_price =
+        GPMPC_WORTH * (cost + moving) / larger(distance, REAL(1e-12));
+    limits.safe_price = rounded_price(larger(limits.safe_price, lowest_price),
+                                      limits.exact_price);
+    if (rows->are_kept_again) {
+        limits.lowest_trial_price = limits.safe_price;
+        limits.affordable_extra_cost = GPMPC_SHARE * (programmed_free_cost + moving);
     } else {
-        limits.lowest_price = larger(price / 256, NO_PRICE);
-        limits.extra_cost = REAL(0.1) * free_cost;
+        limits.lowest_trial_price =
+            larger(GPMPC_LOWEST * limits.safe_price, lowest_price);
+        limits.affordable_extra_cost = GPMPC_SHARE * programmed_free_cost;
     }
     return limits;
 }
 
-/* Sets the price of the rows that give way, the exact one at most. */
-static void set_elastic_price(gpmpc_problem *problem, const int *gives_way, real price)
+/* Sets the prices of rows that give way by one of distances, the exact ones at most. */
+static void lower_prices(gpmpc_problem *problem, const elastic_rows *rows, real price)
 {
     int e;
     for (e = 0; e < r; e++)
-        if (gives_way[e])
-            problem->prices[e] = smaller(price, row_prices[e]);
+        if (rows->gives_way[e])
+            problem->prices[e] = smaller(price / rows->lengths[e], row_prices[e]);
+}
+
+/* Solves the program where rows that give way do not count: they keep their place. */
+static void solve_free(gpmpc_controller *controller, const elastic_rows *rows)
+{
+    gpmpc_problem *problem = &controller->problem;
+    int e;
+    for (e = 0; e < r; e++)
+        if (rows->gives_way[e])
+            problem->prices[e] = GPMPC_NO_PRICE * row_prices[e];
+    solve(problem, &controller->program, &controller->candidate, &controller->elastic);
+}
+
+static void restore_exact_prices(gpmpc_problem *problem)
+{
+    copy(row_prices, problem->prices, r);
 }
 
 /* What it costs to roll the model out along the plan of a solution: infinite where that
@@ -1376,56 +1457,57 @@ static real cost_when_followed(gpmpc_controller *controller,
     return cost_of_plan(problem, states, inputs);
 }
 
-/* Solves the program once more, under another price of the rows that give way. Where
-   that is not solved, the solution under the exact one stays. */
-static void solve_cheaper(gpmpc_controller *controller, const int *gives_way,
+/* Solves the program once more, under a lower price of the rows that give way. Where
+   that is not solved, the solution under the exact ones stays. */
+static void solve_cheaper(gpmpc_controller *controller, const elastic_rows *rows,
                           real price)
 {
     gpmpc_problem *problem = &controller->problem;
     gpmpc_solution *solution = &controller->candidate;
     gpmpc_solution *cheaper = &controller->elastic;
-    set_elastic_price(problem, gives_way, price);
+    lower_prices(problem, rows, price);
     solve(problem, &controller->program, solution, cheaper);
     if (cheaper->status == GPMPC_SOLVED)
         *solution = *cheaper;
     else
-        set_elastic_price(problem, gives_way, LARGEST);
+        restore_exact_prices(problem);
 }
 
 /* Solves the program for the highest price of elastic rows whose plan is affordable:
    the exact one, or one of a few between the lowest and that; the lowest where none is.
  */
-static void raise_elastic_price(gpmpc_controller *controller, const int *gives_way,
-                                real lowest_price, real highest, real affordable_cost)
+static void solve_at_highest_price(gpmpc_controller *controller,
+                                   const elastic_rows *rows, elastic_limits limits,
+                                   real affordable_cost)
 {
     gpmpc_problem *problem = &controller->problem;
-    gpmpc_program *program = &controller->program;
     gpmpc_solution *solution = &controller->candidate;
     gpmpc_solution *trial = &controller->elastic;
-    real price = smaller(lowest_price, highest);
+    real affordable_price = limits.lowest_trial_price;
+    real unaffordable_price = limits.exact_price;
     int is_affordable = 0;
     int i;
     if (cost_when_followed(controller, solution) <= affordable_cost) {
-        set_elastic_price(problem, gives_way, highest);
+        restore_exact_prices(problem);
         return;
     }
-    for (i = 0; i < 5; i++) {
-        real middle = SQRT(price * highest);
-        set_elastic_price(problem, gives_way, middle);
-        solve(problem, program, solution, trial);
+    for (i = 0; i < GPMPC_TRIALS; i++) {
+        real price = SQRT(affordable_price * unaffordable_price);
+        lower_prices(problem, rows, price);
+        solve(problem, &controller->program, solution, trial);
         if (trial->status == GPMPC_SOLVED
             && cost_when_followed(controller, trial) <= affordable_cost) {
             is_affordable = 1;
-            price = middle;
+            affordable_price = price;
             *solution = *trial;
         } else {
-            highest = middle;
+            unaffordable_price = price;
         }
     }
     if (is_affordable)
-        set_elastic_price(problem, gives_way, price);
+        lower_prices(problem, rows, affordable_price);
     else
-        solve_cheaper(controller, gives_way, price);
+        solve_cheaper(controller, rows, affordable_price);
 }
 
 /* Replaces a solution that misses an elastic row by the one under the price that the
@@ -1434,50 +1516,43 @@ static void solve_elastic(gpmpc_controller *controller)
 {
     gpmpc_problem *problem = &controller->problem;
     gpmpc_solution *solution = &controller->candidate;
-    gpmpc_solution *without = &controller->elastic;
+    gpmpc_solution *free_solution = &controller->elastic;
+    elastic_rows rows;
     elastic_limits limits;
     real misses[GPMPC_STATE_ROWS];
     real inputs[GPMPC_SIZE];
     real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
-    int gives_way[r];
-    real guess_cost, affordable_cost;
-    real highest = 0; /* price */
-    int kept_again;
-    int e;
+    real guess_cost;
+    real affordable_cost = INFINITY;
     if (solution->status != GPMPC_SOLVED)
         return;
     write_misses(problem, solution, misses);
-    if (!find_rows_that_give_way(misses, gives_way))
+    find_elastic_rows(problem, misses, &rows);
+    if (rows.count == 0)
         return;
-    kept_again = are_kept_again(misses, gives_way);
-    for (e = 0; e < r; e++)
-        if (gives_way[e])
-            highest = larger(highest, problem->prices[e]);
     guess_cost = cost_of_plan(problem, &problem->states[0][0], &problem->inputs[0][0]);
-    set_elastic_price(problem, gives_way, NO_PRICE);
-    solve(problem, &controller->program, solution, without);
-    if (without->status != GPMPC_SOLVED) {
-        set_elastic_price(problem, gives_way, highest);
+    solve_free(controller, &rows);
+    if (free_solution->status != GPMPC_SOLVED) {
+        restore_exact_prices(problem);
         return;
     }
-    expand(problem, without->x, inputs, states);
-    write_misses(problem, without, misses);
-    limits = limits_of_price(problem, misses, gives_way, kept_again,
+    expand(problem, free_solution->x, inputs, states);
+    write_misses(problem, free_solution, misses);
+    limits = limits_of_price(problem, misses, &rows,
                              cost_of_plan(problem, states, inputs), guess_cost);
-    if (limits.lowest_price >= highest) { /* the exact one is no dearer */
-        set_elastic_price(problem, gives_way, highest);
+    if (limits.lowest_trial_price >= limits.exact_price) {
+        restore_exact_prices(problem);
         return;
     }
-    if (!problem->has_feedback)
+    if (!problem->is_unstable)
         write_gains(problem);
-    affordable_cost = INFINITY;
     if (controller->has_plan)
-        affordable_cost = cost_when_followed(controller, without) + limits.extra_cost;
+        affordable_cost = cost_when_followed(controller, free_solution)
+                          + limits.affordable_extra_cost;
     if (is_finite(affordable_cost))
-        raise_elastic_price(controller, gives_way, limits.lowest_price, highest,
-                            affordable_cost);
+        solve_at_highest_price(controller, &rows, limits, affordable_cost);
     else
-        solve_cheaper(controller, gives_way, limits.least_price);
+        solve_cheaper(controller, &rows, limits.safe_price);
 }
 #endif
 
@@ -1541,7 +1616,7 @@ static void close_defects(gpmpc_controller *controller)
     gpmpc_problem *problem = &controller->problem;
     real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
     real inputs[GPMPC_SIZE];
-    if (!problem->has_feedback)
+    if (!problem->is_unstable)
         write_gains(problem);
     copy(&problem->states[0][0], states, (H + 1) * n);
     copy(&problem->inputs[0][0], inputs, H * m);
@@ -1640,6 +1715,33 @@ static void solve_local(gpmpc_controller *controller)
 #endif
 }
 
+/* How a decision of a solved program ends: by the rows that its plan misses. */
+static int end_of_solved(const gpmpc_controller *controller)
+{
+    const gpmpc_problem *problem = &controller->problem;
+    real misses[GPMPC_AT_LEAST_ONE(GPMPC_STATE_ROWS)];
+    int status = GPMPC_SOLVED;
+    int k, e;
+#if GPMPC_IS_FLOAT && !GPMPC_ROLLS_OUT
+    write_misses(problem, &controller->candidate, misses); /* in doubled digits */
+#else
+    write_misses_of_plan(problem, &problem->states[0][0], &problem->inputs[0][0],
+                         misses);
+#endif
+    for (k = 0; k < H; k++)
+        for (e = 0; e < r; e++) {
+            real value = row_value(problem, k, e, problem->states[k + 1],
+                                   problem->inputs[k]);
+            real rounding = ROUNDING_OF_SUMS * absolute(value);
+            if (misses[k * r + e] <= KEPT + rounding)
+                continue;
+            if (is_hard(e))
+                return GPMPC_HARD_BOUND_MISSED;
+            status = GPMPC_SOFT_BOUND_MISSED;
+        }
+    return status;
+}
+
 /* Decides: solves the program of the problem at the first guess, and takes its step
    whole (the real-time iteration of Diehl, Bock and Schloeder, 2005). Writes plan and
    violation; returns the status, and whether the plan may be applied. */
@@ -1676,11 +1778,7 @@ static int decide(gpmpc_controller *controller, const real *state,
 #else
     controller->violation = solution->violation; /* in doubled digits */
 #endif
-    if (status != GPMPC_SOLVED || !(controller->violation > KEPT))
-        return status;
-    if (GPMPC_ROLLS_OUT && !keeps_hard_rows(problem, KEPT))
-        return GPMPC_HARD_BOUND_MISSED;
-    return GPMPC_SOFT || GPMPC_SMOOTH ? GPMPC_SOFT_BOUND_MISSED : status;
+    return status == GPMPC_SOLVED ? end_of_solved(controller) : status;
 }
 
 /*{filter}*/

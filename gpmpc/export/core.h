@@ -172,6 +172,7 @@ typedef struct {
 #endif
     /* of the program in feedback coordinates: u_k = F_k [s_k; u_{k-1}; 1] + v_k */
     int has_feedback;
+    int is_unstable; /* whether roll-outs follow that feedback, too */
     gpmpc_real feedback[GPMPC_HORIZON][GPMPC_INPUTS][GPMPC_AUGMENTED];
     gpmpc_real hessians[GPMPC_HORIZON][GPMPC_INPUTS][GPMPC_INPUTS];
     /* of condensing */

@@ -129,4 +129,5 @@
 #define KEPT REAL(1e-5)
 #endif
 #define ABSENT REAL(1e20)  /* a bound of this size or more is none */
+#define UNSTABLE_GROWTH REAL(3e7) /* LARGEST_GROWTH of doubles */
 #define FEASIBLE REAL(1e-3) /* by how much a suboptimal plan may miss hard bounds */

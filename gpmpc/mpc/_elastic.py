@@ -32,12 +32,18 @@ that came back without the lane. There the SHARE of J0 is all that the bound may
 and prices below the safe one are among those that are tried.
 
 Bounds that the exact price does keep are none of these: theirs stays.
+
+Rows come in units of their own, and cost in any. So violations count as distances: what
+a row misses over what it rises per unit of distance, its length. Prices here are of
+distances. That of a row is one over its length, its exact price at most: multiplying a
+row by a number, or the whole cost, changes no plan.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
+from gpmpc.mpc._controller import KEPT
 from gpmpc.mpc._linearization import LocalProblem
 
 Array = np.ndarray
@@ -48,32 +54,73 @@ WORTH = 2.0
 # With .05 a car comes back to its lane later; with .2 one of a poor model falls behind.
 SHARE = 0.1
 TRIALS = 5  # prices between the lowest and the exact one
-NO_PRICE = 1e-9  # of a row that does not count: it keeps its place among the others
-_LOWEST = 2.0**-8  # of the safe price, where violations grow along the horizon
-_NO_MOMENT = 1e-6  # share of its terms below which a sum is rounding
-_TINY = 1e-12
+# Of its exact price, for a row that does not count: it keeps its place among others.
+NO_PRICE = 1e-15
+LOWEST = 2.0**-8  # of the safe price, where violations grow along the horizon
+NO_MOMENT = 1e-6  # share of its terms below which a sum is rounding
+NO_WEIGHT = 1e-12  # share of the largest weight below which a direction has none
+_TINY = 1e-12  # a distance
+
+
+class ElasticRows(NamedTuple):
+    """The elastic rows that a program misses under their exact prices.
+
+    Attributes:
+        gives_way: Which of the rows they are (r,).
+        lengths: What each rises per unit of distance (r,), 1 of all others. Where it
+            does not rise alike at all stages it is the mean, by what is missed there.
+        are_kept_again: Whether they are missed early on the horizon rather than late.
+    """
+
+    gives_way: Array
+    lengths: Array
+    are_kept_again: bool
 
 
 class ElasticLimits(NamedTuple):
-    """What elastic rows that cannot be kept may cost.
+    """What elastic rows that cannot be kept may cost; prices are of distances.
 
     Attributes:
         safe_price: Under which no plan outweighs what the cost is for.
         lowest_trial_price: Of those that are tried for a plan that goes on.
+        exact_price: The highest of the rows.
         affordable_extra_cost: What such a plan may cost more than without them.
     """
 
     safe_price: float
     lowest_trial_price: float
+    exact_price: float
     affordable_extra_cost: float
+
+
+def elastic_rows(
+    violations: Array, row_lengths: Array, may_give_way: Array
+) -> ElasticRows:
+    """Returns the rows that give way, since a plan misses them.
+
+    Args:
+        violations: By how much the plan under exact prices misses each row (H, r).
+        row_lengths: What each rises per unit of distance (H, r).
+        may_give_way: The elastic rows that are still at their exact price (r,).
+    """
+    is_missed = (violations / row_lengths).max(axis=0) > KEPT
+    gives_way = may_give_way & is_missed
+    first = row_lengths[0]
+    # exactly the first where all stages have the same
+    beyond_first = (violations * (row_lengths - first)).sum(axis=0)
+    lengths = np.ones(len(first))
+    missed = violations.sum(axis=0)[gives_way]
+    lengths[gives_way] = first[gives_way] + beyond_first[gives_way] / missed
+    distances = (violations / lengths)[:, gives_way].sum(axis=1)
+    return ElasticRows(gives_way, lengths, are_kept_again(distances))
 
 
 def elastic_limits(
     free: LocalProblem,
-    free_cost: float,
+    programmed_free_cost: float,
     guess_cost: float,
-    rows: Array,
-    are_kept_again: bool,
+    rows: ElasticRows,
+    exact_prices: Array,
     Q: Array,
     largest_weight: float,
 ) -> ElasticLimits:
@@ -81,61 +128,86 @@ def elastic_limits(
 
     Args:
         free: With the plan that minimises the cost without these rows.
-        free_cost: Of that plan, J0.
+        programmed_free_cost: Of that plan, J0, as the program sees it.
         guess_cost: Of the first guess, such as the last plan.
-        rows: Which of the r rows they are (r,).
-        are_kept_again: See ``are_kept_again``.
+        rows: Those that give way.
+        exact_prices: Of all rows (r,).
         Q: Weight of the states (n, n), or of those of each stage (H, n, n).
         largest_weight: Of the whole cost, which counts where Q is zero.
     """
-    missed = free.row_violations()[:, rows]
-    H = len(missed)
+    gives_way = rows.gives_way
+    lengths = rows.lengths[gives_way]
+    exact_price = float((exact_prices[gives_way] * lengths).max())
+    missed = free.row_violations()[:, gives_way]
+    moving_cost = _moving_cost(free, missed, gives_way, Q, largest_weight)
+    cost = min(max(programmed_free_cost, guess_cost), 2.0 * programmed_free_cost)
+    distance = float((missed / lengths).sum())
+    safe_price = WORTH * (cost + moving_cost) / max(distance, _TINY)
+    lowest_price = NO_PRICE * exact_price
+    safe_price = _rounded(max(safe_price, lowest_price), exact_price)
+    if rows.are_kept_again:
+        return ElasticLimits(
+            safe_price=safe_price,
+            lowest_trial_price=safe_price,
+            exact_price=exact_price,
+            affordable_extra_cost=SHARE * (programmed_free_cost + moving_cost),
+        )
+    return ElasticLimits(
+        safe_price=safe_price,
+        lowest_trial_price=max(LOWEST * safe_price, lowest_price),
+        exact_price=exact_price,
+        affordable_extra_cost=SHARE * programmed_free_cost,
+    )
+
+
+def are_kept_again(distances: Array) -> bool:
+    """Returns whether rows are missed early on the horizon rather than late.
+
+    ``distances`` are by how much, all rows together, at each stage (H,).
+    """
+    centred_stages = np.arange(len(distances)) - (len(distances) - 1) / 2
+    terms = centred_stages * distances
+    return bool(terms.sum() <= NO_MOMENT * np.abs(terms).sum())
+
+
+def _moving_cost(
+    free: LocalProblem,
+    missed: Array,
+    gives_way: Array,
+    Q: Array,
+    largest_weight: float,
+) -> float:
+    """Returns J_move, what it costs to be beside the reference by violations.
+
+    The violations ``missed`` (H, r') are of the rows that give way; other arguments are
+    those of ``elastic_limits``.
+    """
     n = Q.shape[-1]
-    by_state = _by_stage(free.rows.E, H)[:, rows, :n]
+    H = len(missed)
+    gradients = _by_stage(free.rows.E, H)[:, gives_way, :n]
     state_weights = _by_stage(Q.reshape(-1, n, n), H)
     diagonals = np.diagonal(state_weights, axis1=1, axis2=2)
     largest = diagonals.max(axis=1, keepdims=True)
     largest = np.where(largest > 0.0, largest, largest_weight)
-    squares = (by_state**2).sum(axis=2)
-    weights = np.einsum("kri,kij,krj->kr", by_state, state_weights, by_state)
-    weights = np.where(weights > _TINY * largest * squares, weights, largest * squares)
+    squared_gradients = (gradients**2).sum(axis=2)
+    weights = np.einsum("kri,kij,krj->kr", gradients, state_weights, gradients)
+    has_weight = weights > NO_WEIGHT * largest * squared_gradients
+    weights = np.where(has_weight, weights, largest * squared_gradients)
     if len(free.rows.D):
-        input_squares = (free.rows.D[:, rows] ** 2).sum(axis=2)
-        weights = weights + largest * input_squares
-        squares = squares + input_squares
-    # The cheapest move by a violation v along a gradient g has the size v / |g|.
-    lengths = np.where(squares > 0.0, squares, 1.0)
-    moving_cost = (weights / lengths**2 * missed**2).sum()
-    cost = min(max(free_cost, guess_cost), 2.0 * free_cost) + moving_cost
-    safe_price = WORTH * cost / max(missed.sum(), _TINY)
-    safe_price = _rounded(max(safe_price, NO_PRICE))
-    if are_kept_again:
-        return ElasticLimits(
-            safe_price=safe_price,
-            lowest_trial_price=safe_price,
-            affordable_extra_cost=SHARE * (free_cost + moving_cost),
-        )
-    return ElasticLimits(
-        safe_price=safe_price,
-        lowest_trial_price=max(_LOWEST * safe_price, NO_PRICE),
-        affordable_extra_cost=SHARE * free_cost,
-    )
+        by_input = free.rows.D[:, gives_way]
+        weights = weights + largest * (by_input**2).sum(axis=2)
+    # The cheapest move by a violation v along a gradient g is v g / |g|^2.
+    squared_lengths = free.row_lengths()[:, gives_way] ** 2
+    return float((weights * (missed / squared_lengths) ** 2).sum())
 
 
-def are_kept_again(violations: Array) -> bool:
-    """Returns whether rows are missed (H, r) early on the horizon rather than late."""
-    by_stage = violations.sum(axis=1)
-    centred_stages = np.arange(len(by_stage)) - (len(by_stage) - 1) / 2
-    terms = centred_stages * by_stage
-    return bool(terms.sum() <= _NO_MOMENT * np.abs(terms).sum())
-
-
-def _rounded(price: float) -> float:
-    """Returns a price of few digits, a quarter of a power of two.
+def _rounded(price: float, exact_price: float) -> float:
+    """Returns a price of few digits: the exact one over quarters of powers of two.
 
     Else what rounding does to the cost of a plan would change the plan.
     """
-    return 2.0 ** (np.floor(4.0 * np.log2(price) + 0.5) / 4.0)
+    quarters = np.floor(4.0 * np.log2(price / exact_price) + 0.5)
+    return float(exact_price * 2.0 ** (quarters / 4.0))
 
 
 def _by_stage(parts: Array, horizon: int) -> Array:

@@ -208,6 +208,19 @@ class LocalProblem(NamedTuple):
         outside = np.maximum(values - upper, lower - values)
         return np.maximum(0.0, outside)
 
+    def row_lengths(self) -> Array:
+        """Returns what each row rises per unit of distance (H, r).
+
+        The distance is one of means and inputs together. A row that depends on neither
+        counts as one of length 1.
+        """
+        n = self.covariances.shape[-1]
+        squares = (self.rows.E[:, :, :n] ** 2).sum(axis=2)
+        if len(self.rows.D):
+            squares = squares + (self.rows.D**2).sum(axis=2)
+        lengths = np.where(squares > 0.0, np.sqrt(squares), 1.0)
+        return np.broadcast_to(lengths, self.rows.lower.shape)
+
 
 class PredictionModel:
     """Linearises plans of one controller; checks that its settings fit the model."""
@@ -343,18 +356,19 @@ class PredictionModel:
         return LocalProblem(plan, stages, covariances, rows, cost)
 
     def end_of_solved(self, local: LocalProblem, violation: float) -> Status:
-        """Returns how a decision of a solved program ends: by what its plan misses.
+        """Returns how a decision of a solved program ends: by the rows it misses.
 
         Args:
             local: With the plan.
             violation: By how much the plan misses a bound, at most.
         """
-        constraints = self.constraints
-        if violation <= KEPT or not constraints.per_stage:
+        if violation <= KEPT or not self.constraints.per_stage:
             return Status.SOLVED
         if self.misses_hard_rows(local, KEPT):
             return Status.HARD_BOUND_MISSED
-        return Status.SOFT_BOUND_MISSED
+        if local.row_violations().max() > KEPT:
+            return Status.SOFT_BOUND_MISSED
+        return Status.SOLVED  # what is missed is a bound of inputs, by rounding
 
     def _covariances_of(
         self, plan: Plan, stages: Stages, cost: QuadraticCost, request: Request

@@ -8,13 +8,14 @@ import math
 
 import numpy as np
 
-from gpmpc.mpc._controller import KEPT, Request
+from gpmpc.mpc._controller import Request
 from gpmpc.mpc._elastic import (
     NO_PRICE,
     TRIALS,
     ElasticLimits,
-    are_kept_again,
+    ElasticRows,
     elastic_limits,
+    elastic_rows,
 )
 from gpmpc.mpc._linear_quadratic import CondensedProgram
 from gpmpc.mpc._linearization import LocalProblem, PredictionModel
@@ -78,14 +79,14 @@ class PricedSolver:
         if self._price_is_due and constraints.any_elastic and solution.status.solved:
             self._price_is_due = False
             planned = local.with_solution(program, solution.x, self._request)
-            violations = planned.row_violations()
             is_exact = self.row_prices == constraints.prices
-            is_missed = violations.max(axis=0) > KEPT
-            gives_way = constraints.elastic & is_exact & is_missed
-            if gives_way.any():
-                solution = self._solve_elastic(
-                    program, local, solution, gives_way, violations
-                )
+            rows = elastic_rows(
+                planned.row_violations(),
+                planned.row_lengths(),
+                may_give_way=constraints.elastic & is_exact,
+            )
+            if rows.gives_way.any():
+                solution = self._solve_elastic(program, local, solution, rows)
         self._is_first = False
         return solution
 
@@ -123,9 +124,8 @@ class PricedSolver:
         self,
         program: CondensedProgram,
         local: LocalProblem,
-        exact: QPSolution,
-        gives_way: Array,
-        violations: Array,
+        exact_solution: QPSolution,
+        rows: ElasticRows,
     ) -> QPSolution:
         """Returns the solution under the price that elastic rows are worth.
 
@@ -135,100 +135,102 @@ class PricedSolver:
         Args:
             program: The program.
             local: The problem that it was condensed from.
-            exact: Its solution under the exact prices.
-            gives_way: The elastic rows that this solution misses (r,).
-            violations: By how much it misses all rows (H, r).
+            exact_solution: Its solution under the exact prices.
+            rows: The elastic rows that this solution misses.
         """
         request = self._request
-        free = self._solve_at(program, exact, self._lowered(gives_way, NO_PRICE))
-        if not free.status.solved:
-            return exact
-        free_problem = local.with_solution(program, free.x, request)
+        prediction = self._prediction
+        exact_prices = prediction.constraints.prices
+        no_prices = np.where(rows.gives_way, NO_PRICE * exact_prices, self.row_prices)
+        free_solution = self._solve_at(program, exact_solution, no_prices)
+        if not free_solution.status.solved:
+            return exact_solution
+        free = local.with_solution(program, free_solution.x, request)
         limits = elastic_limits(
-            free_problem,
-            free_cost=float(free_problem.stage_costs(request.references).sum()),
+            free,
+            programmed_free_cost=float(free.stage_costs(request.references).sum()),
             guess_cost=float(local.stage_costs(request.references).sum()),
-            rows=gives_way,
-            are_kept_again=are_kept_again(violations[:, gives_way]),
-            Q=self._prediction.problem.cost.Q,
-            largest_weight=self._prediction.problem.largest_weight,
+            rows=rows,
+            exact_prices=exact_prices,
+            Q=prediction.problem.cost.Q,
+            largest_weight=prediction.problem.largest_weight,
         )
-        if limits.lowest_trial_price >= self._highest_exact_price(gives_way):
-            return exact
-        is_on_the_way = self._is_first and request.last_plan is not None
+        if limits.lowest_trial_price >= limits.exact_price:
+            return exact_solution
+        is_on_the_way = self._is_first and request.continues_last_plan
         if is_on_the_way and not self._stopwatch.is_late:
-            free_cost = self._cost_when_followed(program, local, free)
-            if math.isfinite(free_cost + limits.affordable_extra_cost):
+            followed_free_cost = self._cost_when_followed(program, local, free_solution)
+            affordable_cost = followed_free_cost + limits.affordable_extra_cost
+            if math.isfinite(affordable_cost):
                 return self._solve_at_highest_price(
-                    program, local, exact, gives_way, limits, free_cost
+                    program, local, exact_solution, rows, limits, affordable_cost
                 )
-        return self._solve_cheaper(program, exact, gives_way, limits.safe_price)
+        return self._solve_cheaper(program, exact_solution, rows, limits.safe_price)
 
     def _solve_at_highest_price(
         self,
         program: CondensedProgram,
         local: LocalProblem,
-        exact: QPSolution,
-        gives_way: Array,
+        exact_solution: QPSolution,
+        rows: ElasticRows,
         limits: ElasticLimits,
-        free_cost: float,
+        affordable_cost: float,
     ) -> QPSolution:
         """Returns the solution under the highest price whose plan is affordable.
 
         It is the exact price where that is affordable; else it is found by bisection of
-        its logarithm, and is the lowest trial price where no other will do.
-        ``free_cost`` is what the plan without the elastic rows costs the model.
+        its logarithm, and is the lowest trial price where no other will do. Where there
+        is no time to look for it, it is the safe price. ``affordable_cost`` is what a
+        plan may cost the model.
         """
-        affordable_cost = free_cost + limits.affordable_extra_cost
-        if self._cost_when_followed(program, local, exact) <= affordable_cost:
-            return exact
-        unaffordable_price = self._highest_exact_price(gives_way)
+        if self._cost_when_followed(program, local, exact_solution) <= affordable_cost:
+            return exact_solution
+        unaffordable_price = limits.exact_price
         affordable_price = limits.lowest_trial_price
         best = None
         for _ in range(TRIALS):
             if self._stopwatch.is_late:
                 break
             price = math.sqrt(affordable_price * unaffordable_price)
-            prices = self._lowered(gives_way, price)
-            solution = self._solve_at(program, best or exact, prices)
+            trial_prices = self._lowered(rows, price)
+            solution = self._solve_at(program, best or exact_solution, trial_prices)
             cost = self._cost_when_followed(program, local, solution)
             if solution.status.solved and cost <= affordable_cost:
                 affordable_price = price
                 best = solution
             else:
                 unaffordable_price = price
-        if best is None:
-            return self._solve_cheaper(program, exact, gives_way, affordable_price)
-        self.row_prices = self._lowered(gives_way, affordable_price)
-        return best
+        if best is not None:
+            self.row_prices = self._lowered(rows, affordable_price)
+            return best
+        price = limits.lowest_trial_price
+        if self._stopwatch.is_late:
+            price = limits.safe_price
+        return self._solve_cheaper(program, exact_solution, rows, price)
 
     def _solve_cheaper(
         self,
         program: CondensedProgram,
-        exact: QPSolution,
-        gives_way: Array,
+        exact_solution: QPSolution,
+        rows: ElasticRows,
         price: float,
     ) -> QPSolution:
         """Returns the solution under a lower price, which later programs keep.
 
         Where that is not solved, the solution under the exact prices stays.
         """
-        prices = self._lowered(gives_way, price)
-        cheaper = self._solve_at(program, exact, prices)
+        prices = self._lowered(rows, price)
+        cheaper = self._solve_at(program, exact_solution, prices)
         if not cheaper.status.solved:
-            return exact
+            return exact_solution
         self.row_prices = prices
         return cheaper
 
-    def _lowered(self, gives_way: Array, price: float) -> Array:
-        """Returns prices (r,) of which some rows have a lower one than the exact."""
+    def _lowered(self, rows: ElasticRows, price: float) -> Array:
+        """Returns prices (r,), those of rows that give way by a price of distances."""
         exact_prices = self._prediction.constraints.prices
-        lowered = np.minimum(price, exact_prices)
-        return np.where(gives_way, lowered, self.row_prices)
-
-    def _highest_exact_price(self, gives_way: Array) -> float:
-        """Returns the highest exact price of some rows."""
-        return float(self._prediction.constraints.prices[gives_way].max())
+        lowered = np.minimum(price / rows.lengths, exact_prices)
+        return np.where(rows.gives_way, lowered, self.row_prices)
 
     def _cost_when_followed(
         self, program: CondensedProgram, local: LocalProblem, solution: QPSolution

@@ -129,6 +129,14 @@ def tube(penalty, unit=1.0, **prediction):
     return gpmpc(problem, **prediction)
 
 
+def two_lanes(unit, cost_unit):
+    """Two planes that are narrower than their tubes, one in another unit."""
+    place = Halfspaces([[unit, 0.2 * unit]], [0.3 * unit], kappa=3.0)
+    speed = Halfspaces([[0.5, -1.0]], [0.2], kappa=3.0)
+    cost = Tracking([cost_unit, 0.1 * cost_unit], [0.05 * cost_unit])
+    return gpmpc(Problem(cost, TORQUES, constraints=[place, speed]))
+
+
 def unweighed(unit):
     """A bound of states that nothing weighs but their energy, which gives way."""
     rail = Halfspaces([[unit, 0.0]], [0.05 * unit])
@@ -183,6 +191,8 @@ CONTROLLERS = {
     "elastic tube in a large unit": lambda: tube("elastic", unit=1e-3),
     "exact tube in a large unit": lambda: tube("exact", unit=1e-3),
     "hard tube": lambda: tube(None, rolled_out=True),
+    "two lanes": lambda: two_lanes(1.0, 1.0),
+    "two lanes in unlike units": lambda: two_lanes(1e3, 1e-9),
     "narrow lane": narrow_lane,
     "states that nothing weighs, in a large unit": lambda: unweighed(2.0**-10),
     "obstacle and energy": obstacle,
@@ -272,6 +282,18 @@ def test_holds_the_input_where_that_is_asked():
     assert missed
 
 
+def vessel():
+    """A level that is to rise beyond a hard bound of some hundreds."""
+    filling = Affine(torch.tensor([[0.97]]), torch.tensor([[1.0]]), torch.tensor([0.3]))
+    problem = Problem(
+        Tracking([1.0], [0.05], penalized="inputs"),
+        Box([-20.0], [20.0]),
+        constraints=[Box([-np.inf], [333.3], penalty=None)],
+    )
+    model = KnownModel(filling, 1, 1)
+    return gpmpc(problem, model, covariance="none", rolled_out=True)
+
+
 def test_float_differs_by_little():
     """By 1e-4 of the torques' range, and with the same statuses."""
     controller = tube("elastic")
@@ -283,6 +305,36 @@ def test_float_differs_by_little():
         assert np.abs(compiled.input(measured, reference) - expected).max() < 4e-4
         assert python.last is not None
         assert compiled.status is python.last.status
+
+
+def test_float_rolls_out_under_the_same_feedback():
+    """Here under none, though its program is condensed in feedback coordinates."""
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u")
+    rate = x[1] + 0.2 * (u - 0.3 * x[1] ** 3)
+    slide = casadi.Function("f", [x, u], [casadi.vertcat(x[0] + 0.2 * x[1], rate)])
+    controller = gpmpc(
+        Problem(Tracking([1.0, 0.1], [1e-3]), TORQUES),
+        KnownModel(CasadiFunction(slide), 2, 1),
+        horizon=12,
+        covariance="none",
+        feedback=False,
+        rolled_out=True,
+    )
+    compiled = CompiledController(controller, precision="float", compiler=COMPILER)
+    belief = Gaussian.certain([1.5, -1.0])
+    expected = controller.control(belief, Reference(np.zeros(2)))
+    got = compiled.control(belief, Reference(np.zeros(2)))
+    assert np.abs(got.inputs - expected.inputs).max() < 1e-4
+    assert np.abs(got.means - expected.means).max() < 1e-4
+
+
+def test_float_says_what_is_missed_not_what_is_rounded():
+    controller = vessel()
+    compiled = CompiledLoop(controller, precision="float", compiler=COMPILER)
+    for level in np.linspace(300.0, 333.0, 30):
+        compiled.input([level], np.array([400.0]))
+        assert compiled.status is Status.SOLVED
 
 
 def test_float_pays_no_price_for_a_bound_that_is_kept():
