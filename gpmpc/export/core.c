@@ -1186,7 +1186,6 @@ static void follow(gpmpc_controller *controller, real *states, real *inputs)
 }
 #endif
 
-#if GPMPC_ROLLS_OUT || !GPMPC_IS_FLOAT
 /* Writes by how much a plan misses its rows (H, r), zero inside. */
 static void write_misses_of_plan(const gpmpc_problem *problem, const real *states,
                                  const real *inputs, real *misses)
@@ -1197,10 +1196,8 @@ static void write_misses_of_plan(const gpmpc_problem *problem, const real *state
             misses[k * r + e] = larger(
                 0, row_miss(problem, k, e, states + (k + 1) * n, inputs + k * m));
 }
-#endif
 
-#if GPMPC_ELASTIC || (GPMPC_IS_FLOAT && !GPMPC_ROLLS_OUT)
-/* Writes by how much the plan of a solution misses its rows (H, r), zero inside. */
+/* The same for the plan of a solution, in float in doubled digits. */
 static void write_misses(const gpmpc_problem *problem, const gpmpc_solution *solution,
                          real *misses)
 {
@@ -1222,7 +1219,6 @@ static void write_misses(const gpmpc_problem *problem, const gpmpc_solution *sol
     write_misses_of_plan(problem, states, inputs, misses);
 #endif
 }
-#endif
 
 #if GPMPC_ELASTIC
 /* What a plan costs: its stages, summed. */
@@ -1722,12 +1718,11 @@ static int end_of_solved(const gpmpc_controller *controller)
     real misses[GPMPC_AT_LEAST_ONE(GPMPC_STATE_ROWS)];
     int status = GPMPC_SOLVED;
     int k, e;
-#if GPMPC_IS_FLOAT && !GPMPC_ROLLS_OUT
-    write_misses(problem, &controller->candidate, misses); /* in doubled digits */
-#else
-    write_misses_of_plan(problem, &problem->states[0][0], &problem->inputs[0][0],
-                         misses);
-#endif
+    if (GPMPC_ROLLS_OUT)
+        write_misses_of_plan(problem, &problem->states[0][0], &problem->inputs[0][0],
+                             misses);
+    else
+        write_misses(problem, &controller->candidate, misses);
     for (k = 0; k < H; k++)
         for (e = 0; e < r; e++) {
             real value = row_value(problem, k, e, problem->states[k + 1],
