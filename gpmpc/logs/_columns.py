@@ -14,6 +14,7 @@ import pandas as pd
 from gpmpc.exceptions import DataError
 from gpmpc.logs._file import STAMP, Tables
 from gpmpc.logs._mapping import LogMapping
+from gpmpc.logs._units import said_units, units_of, with_units
 
 LISTED_COLUMNS = 12  # of a table, where one is missing
 
@@ -58,6 +59,9 @@ def check_column(where: str, table: pd.DataFrame, column: str) -> None:
 def named_columns(path: str | Path, tables: Tables, mapping: LogMapping) -> Tables:
     """Gives the columns of a single table the names by which the mapping calls them.
 
+    A column that the mapping calls by its number appears under both names. What the
+    file says of its unit goes with a column, also what its name there says.
+
     Args:
         path: Of the file, for errors.
         tables: Of the file; those of topics stay as they are.
@@ -75,15 +79,20 @@ def named_columns(path: str | Path, tables: Tables, mapping: LogMapping) -> Tabl
             f"{path}: the mapping names {len(mapping.names)} columns; there are "
             f"{len(table.columns)}"
         )
+    unit_by_name = said_units(table)
+    units = [unit_by_name.get(name, "") for name in table]
     if mapping.names:
         others = table.columns[len(mapping.names) :]
         table = with_unique_names(table.set_axis([*mapping.names, *others], axis=1))
-    by_number = {
-        name: table.iloc[:, number - 1]
+    numbers = {
+        name: number
         for name in mapping.used_columns
         if (number := column_number(table, name))
     }
-    return {**tables, "": table.assign(**by_number)}
+    by_number = {name: table.iloc[:, n - 1] for name, n in numbers.items()}
+    unit_of_column = dict(zip(table.columns, units, strict=True))
+    unit_of_column |= {name: units[number - 1] for name, number in numbers.items()}
+    return {**tables, "": with_units(table.assign(**by_number), unit_of_column)}
 
 
 def column_number(table: pd.DataFrame, name: str) -> int:
@@ -114,6 +123,9 @@ def runs_side_by_side(
         for column in columns.values():
             check_column(f"{path}, run {run}", table, column)
         own = table.assign(**{name: table[column] for name, column in columns.items()})
+        units = units_of(table)
+        own_units = {name: units.get(column, "") for name, column in columns.items()}
+        own = with_units(own, {**units, **own_units})
         yield TablesOfRun(run, _until_last_value({"": own}, mapping))
 
 

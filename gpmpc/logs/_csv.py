@@ -26,6 +26,7 @@ from gpmpc.logs._file import (
 )
 from gpmpc.logs._findings import Finding
 from gpmpc.logs._list_cells import unpack_lists
+from gpmpc.logs._units import with_units
 
 LONGEST_LINE = 2**20  # of a text file [bytes]
 _DELIMITERS = [mark.encode() for mark in DELIMITERS]
@@ -47,8 +48,9 @@ def read_csv(path: Path, options: ReadOptions) -> LogFile:
             warnings.simplefilter("error", pd.errors.ParserWarning)
             table = _read_in_parts(csv, budget)
     table.columns = _column_names(csv)
+    units = dict(zip(table.columns, csv.units, strict=False))
     table = unpack_lists(path, _without_empty_end(table), budget)
-    return LogFile({"": table}, tuple(_findings(path, csv)))
+    return LogFile({"": with_units(table, units)}, tuple(_findings(path, csv)))
 
 
 def _column_names(csv: CsvText) -> list[str]:

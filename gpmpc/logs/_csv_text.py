@@ -47,10 +47,11 @@ class CsvText(NamedTuple):
     #: of the columns, as they stand there: a name may be empty, or come twice; none
     #: where the text names no column
     names: Fields
+    units: Fields  #: of the columns, as the line below the names says; none without one
     columns: int  #: their number
     delimiter: str  #: ``WHITE_SPACE`` for any of it
     decimal: str
-    skipped: int  #: lines before the rows that are neither names nor comments
+    skipped: int  #: lines before the rows: neither names, nor units, nor comments
 
     @property
     def is_cut(self) -> bool:
@@ -62,9 +63,10 @@ class CsvText(NamedTuple):
 
 
 class _Header(NamedTuple):
-    """The names of the columns; the other lines before the rows, which are skipped."""
+    """The names of the columns and their units, and the count of the other lines."""
 
     names: Fields
+    units: Fields
     skipped: int
 
 
@@ -98,6 +100,7 @@ def open_csv(where: str, file: io.BufferedReader) -> CsvText:
     return CsvText(
         stream=_CsvStream(head[first:], lines, width),
         names=header.names,
+        units=header.units,
         columns=columns,
         delimiter=delimiter,
         decimal=_decimal_mark(rows),
@@ -304,28 +307,31 @@ def _find_header(
         delimiter: Of the rows.
     """
     if not rows:
-        return _Header(_split_line(lines[0], delimiter), skipped=0)
+        return _Header(_split_line(lines[0], delimiter), units=[], skipped=0)
     if lines and _counts_columns(_split_line(lines[-1], delimiter)):
-        return _Header([], skipped=len(lines))  # other numbers than a mapping counts by
+        # other numbers than a mapping counts by
+        return _Header([], units=[], skipped=len(lines))
     for separators in ((delimiter,), DELIMITERS):
-        names = _last_names(lines[-_HEADER:], rows, separators)
+        names, units = _last_names(lines[-_HEADER:], rows, separators)
         if names:
-            return _Header(names, skipped=len(lines) - 1)
-        names = _last_names(comments, rows, separators)
+            understood = 2 if units else 1
+            return _Header(names, units, skipped=len(lines) - understood)
+        names, units = _last_names(comments, rows, separators)
         if names:
-            return _Header(names, skipped=len(lines))
-    return _Header([], skipped=len(lines))
+            return _Header(names, units, skipped=len(lines))
+    return _Header([], units=[], skipped=len(lines))
 
 
 def _last_names(
     lines: Sequence[str], rows: Sequence[Fields], separators: Sequence[str]
-) -> Fields:
-    """Returns the names in the last line that has some, before one of units."""
+) -> tuple[Fields, Fields]:
+    """Returns the names in the last line that has some, and the units in one behind."""
     candidates = [_split_names(line, rows, separators) for line in lines]
     candidates = [names for names in candidates if names]
     if len(candidates) > 1 and _are_units(candidates[-1]):
-        return candidates[-2]
-    return candidates[-1] if candidates else []
+        units = [field.strip("[]() ") for field in candidates[-1]]
+        return candidates[-2], units
+    return (candidates[-1], []) if candidates else ([], [])
 
 
 def _split_names(

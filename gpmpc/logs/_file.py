@@ -42,6 +42,7 @@ class LogReader(Protocol):
 
     The time of a row is in seconds: in the column ``STAMP`` of a message, or else in
     the column "timestamp"; another column is the mapping's to name, with its unit.
+    What the file itself says of units goes with the table (``_units.with_units``).
 
     A reader counts what it will allocate (``gpmpc._bounds.MemoryBudget``) before it
     does, and may raise whatever its library raises: ``read_file`` makes a ``DataError``

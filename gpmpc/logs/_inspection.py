@@ -31,20 +31,24 @@ from gpmpc.logs._columns import (
     named_columns,
 )
 from gpmpc.logs._delays import Delay, delay_table, find_delays
-from gpmpc.logs._file import STAMP, Tables
+from gpmpc.logs._file import Tables
 from gpmpc.logs._findings import Finding
 from gpmpc.logs._formats import read_file
 from gpmpc.logs._log import Log
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._read_log import read_log
 from gpmpc.logs._regression import Standardization, fit_affine
-from gpmpc.logs._row_times import read_dates, row_times, unit_in_name
+from gpmpc.logs._row_times import (
+    read_dates,
+    row_times,
+    time_unit,
+    unread_times,
+    usual_time_column,
+)
 from gpmpc.logs._runs import split_into_runs
 from gpmpc.logs._signals import holds_times, read_column
 from gpmpc.logs._time_step import JITTER
 
-# columns that hold the time where nobody says which
-TIMES = (STAMP, "timestamp", "t", "time", "stamp", "Time", "seconds")
 EVEN = 1e-3  # of its step: a column that rises as evenly may be the time
 DRAWN = 3000  # points of a channel's line
 MOST_DELAYS = 20  # that are listed
@@ -378,10 +382,11 @@ def _times_of(
     if named:
         check_column(str(path), table, named)
     else:
-        unit_of_mapping = unit
-        named, unit = _usual_time_column(table)
-        if named == "timestamp" and not source.topic:  # as ``read_log`` takes it
-            unit = unit_of_mapping
+        named = usual_time_column(table)
+        if mapping is not None:
+            named = unread_times(table, mapping)
+        if named != "timestamp" or source.topic:  # the mapping's is of ``timestamp``
+            unit = ""
     if not named:
         return _Times(np.arange(len(table), dtype=float), are_rows=True)
     if holds_times(table, named):
@@ -390,20 +395,8 @@ def _times_of(
     if dates is not None:
         return _Times(dates, column=named)
     stamps = pd.to_numeric(table[named], errors="coerce").to_numpy(float)
-    unit = unit or unit_in_name(named) or "s"
+    unit = unit or time_unit(table, named) or "s"
     return _Times(stamps * TIME_UNITS[unit], column=named)
-
-
-def _usual_time_column(table: pd.DataFrame) -> tuple[str, str]:
-    """Finds a column that is called as times are, and its unit; empty without one."""
-    for name in TIMES:
-        if name in table:
-            return name, "s"
-    for name in table:
-        unit = unit_in_name(str(name))
-        if unit:
-            return name, unit
-    return "", "s"
 
 
 def _read_clock(stamps: Array) -> _Clock:

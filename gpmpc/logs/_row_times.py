@@ -1,7 +1,5 @@
 """Makes the times of rows: of their stamps, or of a constant step without stamps."""
 
-import re
-
 import numpy as np
 import pandas as pd
 
@@ -10,26 +8,31 @@ from gpmpc.exceptions import DataError
 from gpmpc.logs._file import STAMP
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._signals import holds_times, read_column, seconds
+from gpmpc.logs._units import unit_in_name, units_of
 
+# columns that hold the time where nobody says which
+TIMES = (STAMP, "timestamp", "t", "time", "stamp", "Time", "seconds")
 LONGEST_UNSTATED = 3600.0  # [s] between rows whose stamps nobody gave a unit
-# names of times that say their unit: "Time [ms]", "time (us)", "t_s"; TimeUS is
-# ArduPilot's
-_TIME_WITH_UNIT = re.compile(
-    r"(?:[Tt]ime|[Tt]imestamp|t)(?: ?[\[(](s|ms|us|ns)[\])]|_(s|ms|us|ns))"
-)
-_TIME_US = "TimeUS"
 
 
-def unit_in_name(column: str) -> str:
-    """Returns the unit that the name of a column of times says; empty for none.
+def time_unit(table: pd.DataFrame, column: str) -> str:
+    """Returns the unit of a column of times that the file says; empty for none.
 
-    >>> unit_in_name("t_ms"), unit_in_name("time [us]"), unit_in_name("t")
-    ('ms', 'us', '')
+    It stands in a line of units, or in the column's name.
     """
-    if column == _TIME_US:
-        return "us"
-    match = _TIME_WITH_UNIT.fullmatch(column)
-    return (match[1] or match[2]) if match is not None else ""
+    stated = units_of(table).get(column, "")
+    return stated if stated in TIME_UNITS else unit_in_name(column)
+
+
+def usual_time_column(table: pd.DataFrame) -> str:
+    """Finds a column that is called as times are; empty without one."""
+    for name in TIMES:
+        if name in table:
+            return name
+    for name in map(str, table):
+        if unit_in_name(name):
+            return name
+    return ""
 
 
 def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array:
@@ -40,7 +43,7 @@ def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array
         table: Whose rows they are.
         column: That holds them.
         unit: Of numbers; dates and durations have their own. Where it is empty, it is
-            what the column's name says, or s.
+            what the file says (see ``time_unit``), or s.
 
     Raises:
         DataError: The column is missing, or holds something else, or rows are hours
@@ -59,7 +62,7 @@ def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array
         raise DataError(f"{error}; {hint}") from error
     if holds_times(table, column):
         return times
-    stated = unit or unit_in_name(column)
+    stated = unit or time_unit(table, column)
     times = times * TIME_UNITS[stated or "s"]
     if not stated:
         _check_unstated_unit(where, times, column)
@@ -96,7 +99,7 @@ def read_dates(table: pd.DataFrame, column: str) -> Array | None:
 def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | None:
     """Returns the times (K,) [s] of rows whose step the mapping says; None otherwise.
 
-    Its step is ``time.step``, or that of its ``rate`` where a table has no stamps.
+    Its step is ``time.step``, or that of its ``rate`` where a table has no times.
 
     Args:
         where: Names the table, for errors.
@@ -111,11 +114,22 @@ def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | N
     if isinstance(step, str):
         step = _only_number(where, table, step)
     if step is not None:
-        unit = TIME_UNITS[mapping.time_unit or "s"]
-        return _steps_from_first(table) * step * unit
-    if mapping.rate and STAMP not in table and "timestamp" not in table:
+        unit = mapping.time_unit
+        if isinstance(mapping.time_step, str):
+            unit = unit or time_unit(table, mapping.time_step)
+        return _steps_from_first(table) * step * TIME_UNITS[unit or "s"]
+    if mapping.rate and not unread_times(table, mapping):
         return _steps_from_first(table) / mapping.rate
     return None
+
+
+def unread_times(table: pd.DataFrame, mapping: LogMapping) -> str:
+    """Returns the column of a table that is called as times are; empty without one.
+
+    One that is a signal, such as t of a temperature, is no time.
+    """
+    others = [name for name in table if name not in mapping.signal_columns]
+    return usual_time_column(table[others])
 
 
 def _steps_from_first(table: pd.DataFrame) -> Array:

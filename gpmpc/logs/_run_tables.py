@@ -28,8 +28,9 @@ from gpmpc.logs._resampling import (
     grid_of_rows,
     resample,
 )
-from gpmpc.logs._row_times import read_times, row_times
+from gpmpc.logs._row_times import read_times, row_times, unread_times
 from gpmpc.logs._signals import nan_zero_dropouts, read_column, read_signal
+from gpmpc.logs._units import conversion, is_known, units_of
 
 MANY_REPEATS = 0.2  # of the rows that stay: stamps that are rounded repeat as often
 USUAL_GAP = 1.5  # time steps; a longer one is a gap where the mapping names none
@@ -76,6 +77,8 @@ def tabulate(
         topic: _read_topic(topic, where, tables[topic], mapping, findings)
         for topic in dict.fromkeys(signal.topic for signal in mapping.signals)
     }
+    for topic in topics.values():
+        _note_units(units_of(topic.table), mapping, findings)
     grid = _make_grid(where, topics, mapping, findings, budget)
     columns = []
     for signal in mapping.signals:
@@ -123,6 +126,31 @@ def _read_topic(
     return _Topic(where=where, table=measured, stamps=stamps)
 
 
+def _note_units(
+    units: Mapping[str, str], mapping: LogMapping, findings: RunFindings
+) -> None:
+    """Notes columns of which the file says another unit than the mapping.
+
+    Args:
+        units: That the file says, by column.
+        mapping: One that scales a signal knows better.
+        findings: Of the run.
+    """
+    texts = []
+    for signal in mapping.signals:
+        taken = conversion("unit", signal.unit)
+        for column, scale in zip(signal.columns, signal.scales, strict=True):
+            unit = units.get(column, "")
+            if scale != 1 or not unit or not is_known(unit):
+                continue
+            if not np.isclose(conversion("unit", unit).factor, taken.factor, rtol=1e-9):
+                texts.append(
+                    f"{column} in {unit} (taken as {signal.unit or 'no unit'})"
+                )
+    text = f"the file says other units than the mapping: {', '.join(texts)}"
+    findings.add("unit", len(texts), text)
+
+
 def _stamped_rows(
     topic: str, table: pd.DataFrame, findings: RunFindings
 ) -> pd.DataFrame:
@@ -149,10 +177,7 @@ def _read_time(
         return stamps
     column = STAMP if STAMP in table else "timestamp"
     if column not in table:
-        raise DataError(
-            f"{where}: the mapping names no column of stamps (time: NAME) and no "
-            "constant step of the rows (time: {step: 0.1})"
-        )
+        raise DataError(f"{where}: {_without_times(table, mapping)}")
     if topic and mapping.time_unit not in ("", "s"):
         raise SettingError(
             "time.unit",
@@ -160,6 +185,22 @@ def _read_time(
             f"{mapping.time_unit!r} alone",
         )
     return read_times(where, table, column, mapping.time_unit)
+
+
+def _without_times(table: pd.DataFrame, mapping: LogMapping) -> str:
+    """Says that a mapping says no times, and what it may say."""
+    column = unread_times(table, mapping)
+    if not column:
+        return (
+            "the mapping names no column of stamps (time: NAME) and no constant step "
+            "of the rows (time: {step: 0.1})"
+        )
+    step = 1 / mapping.rate if mapping.rate else 0.1
+    return (
+        f"column {column!r} is called as times are, and the mapping names no column of "
+        f"stamps: time: {{column: {column!r}}} takes it; time: {{step: {step:.6g}}} "
+        "counts the rows instead"
+    )
 
 
 def _note_stamps(

@@ -5,9 +5,11 @@ An unknown unit is an error: to take it as it stands would leave feet as metres.
 """
 
 import re
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from gpmpc.exceptions import SettingError
 
@@ -60,6 +62,14 @@ SYMBOLS = {
     "g": Conversion("m/s2", 9.80665),  # standard gravity, not the gram
 }
 _NO_UNIT = ("", "1", "-")
+_UNITS_KEY = "units"  # in the ``attrs`` of a table
+# names of times that say their unit: "Time [ms]", "time (us)", "t_s"; TimeUS is
+# ArduPilot's
+_TIME_WITH_UNIT = re.compile(
+    r"(?:[Tt]ime|[Tt]imestamp|t)(?: ?[\[(](s|ms|us|ns)[\])]|_(s|ms|us|ns))"
+)
+_TIME_US = "TimeUS"
+_NAME_WITH_UNIT = re.compile(r".*\S ?(?:\[([^\[\]]+)\]|\(([^()]+)\))")
 _FACTOR = re.compile(r"([A-Za-z%]+)\^?((?:-?\d)?)")
 
 
@@ -96,6 +106,48 @@ def is_known(unit: str) -> bool:
     except SettingError:
         return False
     return True
+
+
+def unit_in_name(column: str) -> str:
+    """Returns the unit that the name of a column of times says; empty for none.
+
+    >>> unit_in_name("t_ms"), unit_in_name("time [us]"), unit_in_name("t")
+    ('ms', 'us', '')
+    """
+    if column == _TIME_US:
+        return "us"
+    match = _TIME_WITH_UNIT.fullmatch(column)
+    return (match[1] or match[2]) if match is not None else ""
+
+
+def unit_in_brackets(name: str) -> str:
+    """Returns the unit at the end of a column's name; empty where there is none.
+
+    >>> unit_in_brackets("speed [km/h]"), unit_in_brackets("motor (left)")
+    ('km/h', '')
+    """
+    match = _NAME_WITH_UNIT.fullmatch(name)
+    unit = (match[1] or match[2]).strip() if match is not None else ""
+    return unit if is_known(unit) else ""
+
+
+def units_of(table: pd.DataFrame) -> dict[str, str]:
+    """Returns the units that a file says of a table's columns, by their names."""
+    return dict(table.attrs.get(_UNITS_KEY, {}))
+
+
+def said_units(table: pd.DataFrame) -> dict[str, str]:
+    """Returns the units that a file says of a table's columns, also in their names."""
+    in_names = {name: unit_in_name(name) or unit_in_brackets(name) for name in table}
+    units = {name: unit for name, unit in in_names.items() if unit}
+    return {**units, **{name: unit for name, unit in units_of(table).items() if unit}}
+
+
+def with_units(table: pd.DataFrame, units: Mapping[str, str]) -> pd.DataFrame:
+    """Returns a table with what a file says of its units, in place of before."""
+    table = table.copy(deep=False)
+    table.attrs = {**table.attrs, _UNITS_KEY: dict(units)}
+    return table
 
 
 def _product(key: str, unit: str, text: str) -> Conversion:

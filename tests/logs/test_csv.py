@@ -65,6 +65,30 @@ def test_every_way_of_writing_numbers_is_read(tmp_path, content):
     np.testing.assert_allclose(table[["t", "x", "u"]], TABLE, rtol=1e-15)
 
 
+@pytest.mark.parametrize(
+    ("header", "unit", "said"),
+    [
+        ("t,x,u\n[s],[mm],[V]\n", "", "x in mm (taken as no unit)"),
+        ("t,x,u\ns,mm,N\n", "m", "x in mm (taken as m)"),
+        ("t,x [km/h],u\n", "m/s", "x [km/h] in km/h (taken as m/s)"),
+        ("t,x [km/h],u\n", "km/h", ""),
+        ("t,x (left),u [A]\n", "m", ""),
+    ],
+)
+def test_units_that_the_file_says_and_the_mapping_does_not_are_found(
+    tmp_path, header, unit, said
+):
+    (tmp_path / "log.csv").write_text(header + TEXT.partition("\n")[2])
+    x, u = header.split("\n")[0].split(",")[1:]
+    states = {"x": {"columns": [x], "unit": unit}}
+    log = read_log(
+        tmp_path / "log.csv", {"time": "t", "states": states, "inputs": {"u": [u]}}
+    )
+    texts = [finding.text for finding in log.findings]
+    whole = f"the file says other units than the mapping: {said}"
+    assert texts == ([whole] if said else [])
+
+
 @pytest.mark.parametrize("missing", [1, 5, 12, 20, 30])
 def test_a_last_line_without_an_end_is_left_out_and_said(tmp_path, missing):
     cut = TEXT[:-missing]

@@ -279,6 +279,67 @@ def test_rows_that_a_run_lacks_took_time_as_well(tmp_path, time, runs, pieces):
     } == pieces
 
 
+@pytest.mark.parametrize("name", ["t", "time", "Time [s]", "time (us)", "TimeUS"])
+def test_rows_of_a_rate_are_not_counted_where_a_column_is_called_as_times_are(
+    tmp_path, name
+):
+    table = strange.pendulum(ROWS).rename(columns={"t": name})
+    table.to_csv(tmp_path / "arm.csv", index=False)
+    signals = {key: TABLE_MAPPING[key] for key in ("states", "inputs")}
+    with pytest.raises(DataError, match="is called as times are.*time: {step: 0.02}"):
+        read_log(tmp_path / "arm.csv", {**signals, "rate": 50})
+    with pytest.raises(DataError, match="is called as times are"):
+        read_log(tmp_path / "arm.csv", signals)
+    mapping = LogMapping.from_dict({**signals, "rate": 50})
+    warnings = " ".join(inspect_log(tmp_path / "arm.csv", mapping).warnings)
+    assert "is called as times are" in warnings
+
+
+SIGNALS = {"states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
+
+
+@pytest.mark.parametrize(
+    ("header", "mapping"),
+    [
+        ("t,x,u\nms,m,N\n", {"time": "t", **SIGNALS}),
+        ("t,x,u\n(ms),(m),(N)\n\n", {"time": "t", **SIGNALS}),
+        ("t_ms,x,u\n", {"time": 1, **SIGNALS}),
+        ("t_ms,x,u\n", {"time": "t", "names": ["t"], **SIGNALS}),
+        ("t [ms],x,u\n", {"time": "T", "runs": {"a": {"T": "t [ms]"}}, **SIGNALS}),
+    ],
+)
+def test_the_unit_that_a_file_says_of_its_times_is_taken(tmp_path, header, mapping):
+    rows = [f"{20 * k},{k % 7},{k % 3}\n" for k in range(60)]
+    (tmp_path / "a.csv").write_text(header + "".join(rows))
+    log = read_log(tmp_path / "a.csv", mapping)
+    assert log.time_step == pytest.approx(0.02)
+    assert not kinds(log)
+
+
+def test_the_time_step_in_a_column_has_the_unit_that_the_file_says(tmp_path):
+    rows = [f"20,{k % 7},{k % 3}\n" for k in range(60)]
+    (tmp_path / "a.csv").write_text("Ts,x,u\n[ms],[m],[N]\n" + "".join(rows))
+    log = read_log(tmp_path / "a.csv", {"time": {"step": "Ts"}, **SIGNALS})
+    assert log.time_step == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("rate", [60, 120, 240, 400])
+def test_the_step_of_stamps_that_are_rounded_to_ms_is_that_of_the_clock(tmp_path, rate):
+    table = strange.pendulum(ROWS)
+    table["t"] = np.round(np.arange(ROWS) / rate, 3)
+    table.to_csv(tmp_path / "arm.csv", index=False)
+    log = read_log(tmp_path / "arm.csv", TABLE_MAPPING)
+    assert log.time_step == pytest.approx(1 / rate, rel=2e-3)
+
+
+def test_rows_that_come_late_leave_the_time_step_as_it_is(tmp_path):
+    table = strange.pendulum(ROWS)
+    table.loc[5::20, "t"] += 0.95 * STEP
+    table.to_csv(tmp_path / "arm.csv", index=False)
+    log = read_log(tmp_path / "arm.csv", TABLE_MAPPING)
+    assert log.time_step == pytest.approx(STEP)
+
+
 def test_a_table_of_one_time_is_refused(tmp_path):
     strange.pendulum(ROWS).assign(t=1.0).to_csv(tmp_path / "arm.csv", index=False)
     with pytest.raises(DataError, match="no two rows have different stamps"):
