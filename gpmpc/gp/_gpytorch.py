@@ -24,7 +24,7 @@ from gpmpc.gp._gpytorch_checks import (
     training_features,
 )
 from gpmpc.gp._kernel import Hyperparameters
-from gpmpc.gp._posterior import GPPosterior
+from gpmpc.gp._posterior import GPPosterior, check_posterior
 from gpmpc.gp._scaling import Scaling, identity
 from gpmpc.gp._sparse import Method, sparse_posterior
 from gpmpc.gp._tensor_checks import Predicts
@@ -78,16 +78,18 @@ class BatchExactGP(gpytorch.models.ExactGP):
 def to_gpytorch(posterior: GPPosterior) -> BatchExactGP:
     """Builds the GPyTorch model of a posterior.
 
-    Its prior mean is a constant that training leaves alone. Its noise is that of the
-    targets, ``GPPosterior.observation_noise``.
+    It is on the posterior's device, in float64. Its prior mean is a constant that
+    training leaves alone. Its noise is that of the targets,
+    ``GPPosterior.observation_noise``.
 
     Raises:
         UnsupportedModel: The posterior holds a sparse model's pseudo-observations,
-            whose noise no likelihood of GPyTorch has.
+            whose noise no likelihood of GPyTorch has, or is none.
 
     See Also:
         ``from_gpytorch``, the way back.
     """
+    check_posterior("posterior", posterior)
     noise = posterior.observation_noise
     if noise is None:
         raise UnsupportedModel(
@@ -104,7 +106,7 @@ def to_gpytorch(posterior: GPPosterior) -> BatchExactGP:
     log_noise = noise.log() / 2
     theta = torch.column_stack([log_lengthscales, log_signal, log_signal - log_noise])
     model.set_hyperparameters(theta)
-    return model.eval()
+    return model.to(posterior.device).eval()
 
 
 @explains_arguments
@@ -162,7 +164,8 @@ def from_gpytorch(
     )
     offset = _joined([member.offset for member in members])
     inducing = [points for member in members for points in member.inducing]
-    if not inducing:
+    are_sparse = [bool(member.inducing) for member in members]
+    if not any(are_sparse):
         return GPPosterior.from_hyperparameters(
             features,
             targets,
@@ -174,7 +177,7 @@ def from_gpytorch(
             offset=offset,
             signals=signals,
         )
-    if len(inducing) not in (1, targets.shape[1]) or not all_equal(inducing):
+    if not all(are_sparse) or not all_equal(inducing):
         raise ShapeError(
             "all outputs must be sparse, with the same inducing points (M, d); "
             "got different ones"
@@ -205,7 +208,7 @@ class _SEARDModel(NamedTuple):
     signal_variance: Tensor  #: (k,)
     noise_variance: Tensor  #: (k,)
     offset: Tensor  #: the prior means (k,)
-    #: inducing points (M, d) of a sparse model, one or one a member of a batch
+    #: inducing points (M, d), one or one a member of a batch; none of an exact model
     inducing: list[Tensor]
 
 

@@ -35,13 +35,12 @@ from gpmpc.exceptions import (
     DataError,
     SettingError,
     ShapeError,
-    UnsupportedModel,
     check_choice,
     check_number,
 )
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp._kernel import check_positive_definite, kernel_matrix
-from gpmpc.gp._posterior import GPPosterior
+from gpmpc.gp._posterior import GPPosterior, check_posterior
 from gpmpc.gp._tensor_checks import check_gp_tensors
 from gpmpc.gp._transitions import Transitions, check_transitions
 
@@ -59,8 +58,8 @@ def append_transitions(posterior: GPPosterior, transitions: Transitions) -> GPPo
 
     Raises:
         ShapeError: The transitions have other dimensions.
-        UnsupportedModel: The GPs predict values, which transitions do not hold: use
-            ``append_points``.
+        UnsupportedModel: The model is no ``GPPosterior``, or its GPs predict values,
+            which transitions do not hold: use ``append_points``.
         SettingError: The larger kernel matrix is not positive definite in this dtype.
 
     >>> from gpmpc.datasets import RandomData
@@ -91,6 +90,7 @@ def append_points(
         targets: (p, k).
 
     Raises:
+        UnsupportedModel: The model is no ``GPPosterior``.
         ShapeError: The points have other dimensions, or there is none.
         SettingError: The larger kernel matrix is not positive definite in this dtype.
         DataError: An entry is not finite.
@@ -146,6 +146,7 @@ def _checked_points(
     posterior: GPPosterior, features: Tensor, targets: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Converts points to the posterior's type, and checks that they belong to it."""
+    check_posterior("posterior", posterior)
     check_tensors(features=features, targets=targets)
     for key, value in (("features", features), ("targets", targets)):
         if value.is_complex():
@@ -176,6 +177,7 @@ def remove_points(
     """Removes points (rows of ``features``) from a posterior's data.
 
     Raises:
+        UnsupportedModel: The model is no ``GPPosterior``.
         SettingError: An index is out of range or stands there twice.
         DataError: No point is left.
         torch.linalg.LinAlgError: So many are removed that the rest is factorised anew,
@@ -184,6 +186,7 @@ def remove_points(
     See Also:
         ``append_points``; ``SlidingWindow``.
     """
+    check_posterior("posterior", posterior)
     size = len(posterior)
     removed = _checked_indices(indices, size)
     if not removed:
@@ -242,6 +245,7 @@ def targets_of(posterior: GPPosterior, transitions: Transitions) -> Tensor:
 
     Errors are those of ``append_transitions``.
     """
+    check_posterior("posterior", posterior)
     check_transitions(transitions, posterior)
     return transitions.targets(posterior.predicts)
 
@@ -279,12 +283,6 @@ class SlidingWindow:
 
         Errors are those of ``append_transitions``.
         """
-        if not isinstance(posterior, GPPosterior):
-            got = type(posterior).__name__
-            raise UnsupportedModel(
-                "a window is for a GPPosterior (ResidualModel.append takes one); "
-                f"got {got}"
-            )
         targets = targets_of(posterior, transitions)
         return self.append(posterior, transitions.features, targets)
 

@@ -27,6 +27,7 @@ from gpmpc._dynamics import (
     tensors_for,
     to_array,
 )
+from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays
 from gpmpc.gp._backend import check_and_choose_compiled
 from gpmpc.gp._kernel import factorize, kernel_matrix, kernel_of_squares
@@ -465,3 +466,13 @@ class _Jacobian(NamedTuple):
 
     by_state: Tensor  #: (*batch, k, n)
     by_input: Tensor  #: (*batch, k, m)
+
+
+def check_posterior(key: str, posterior: Any) -> None:
+    """Raises ``UnsupportedModel`` of a model that is no ``GPPosterior``."""
+    if isinstance(posterior, GPPosterior):
+        return
+    got = type(posterior).__name__
+    if hasattr(posterior, "residual") and hasattr(posterior, "append"):
+        got += f" (its GPs are its `residual`; {got}.append takes transitions)"
+    raise UnsupportedModel(f"{key} must be a GPPosterior; got {got}")

@@ -31,7 +31,7 @@ from gpmpc.gp._data_checks import (
 from gpmpc.gp._kernel import Hyperparameters
 from gpmpc.gp._memory import check_memory
 from gpmpc.gp._online import targets_of
-from gpmpc.gp._posterior import GPPosterior
+from gpmpc.gp._posterior import GPPosterior, check_posterior
 from gpmpc.gp._prior_scales import PriorLengthscales
 from gpmpc.gp._scaling import Scaling, centre
 from gpmpc.gp._search import (
@@ -200,7 +200,7 @@ class Trainer:
             UnsupportedModel: The posterior holds a sparse model's pseudo-observations,
                 or is none. Further errors are those of ``fit``.
         """
-        _check_posterior("posterior", posterior)
+        check_posterior("posterior", posterior)
         noise = posterior.observation_noise
         if noise is None:
             raise UnsupportedModel(
@@ -361,7 +361,7 @@ class Trainer:
         """
         if start is None:
             return [None] * data.targets.shape[1]
-        _check_posterior("start", start)
+        check_posterior("start", start)
         theta = scaled_theta(start, data.feature_scaling, data.target_scaling)
         start_features = start.features.cpu().double().numpy()
         was_constant = constant_columns(start_features, self.resolution)
@@ -445,10 +445,3 @@ def _deviation_of_constant(data: TrainingData, output: int) -> float | None:
     if deviations is None or not data.constant.outputs[output]:
         return None
     return deviations[output] / float(data.target_scaling.factor[output])
-
-
-def _check_posterior(key: str, posterior: Any) -> None:
-    if not isinstance(posterior, GPPosterior):
-        raise UnsupportedModel(
-            f"{key} must be a GPPosterior; got {type(posterior).__name__}"
-        )

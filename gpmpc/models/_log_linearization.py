@@ -6,16 +6,19 @@ nominal part and kinematics are functions of a state and of the inputs as they a
 only they are differentiated by central differences, all points in one batch.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
+from gpmpc._angles import wrap
 from gpmpc._dynamics import Array, Linearized
 from gpmpc.models._log_model import LogModel, OutputGP
 
-DIFFERENCE = 1e-5  # of central differences, relative to entries above one
+#: of central differences, relative to entries above one; angles differ by radians
+#: whatever their turns
+DIFFERENCE = 1e-5
 
 
 class LogLinearizer:
@@ -33,6 +36,7 @@ class LogLinearizer:
         self._time_step = time_step
         self._n = model.kinematics.space.dim
         self._o = len(model.history)
+        self._angles = list(model.kinematics.space.angles)
         self._maps = _linear_maps(model, input_dim, time_step)
 
     def __call__(self, states: Array, inputs: Array, covariance: bool) -> Linearized:
@@ -123,7 +127,7 @@ class LogLinearizer:
             return np.concatenate([features, nominal], axis=-1)
 
         point = np.concatenate([x, acting], axis=-1)
-        value, slopes = _central_differences(values, point)
+        value, slopes = _central_differences(values, point, self._angles)
         return _Point(
             features=value[:, :d],
             nominal=value[:, d:],
@@ -139,9 +143,10 @@ class LogLinearizer:
             state, outputs = point[..., :n], point[..., n:]
             return self._model.kinematics.step(state, outputs, self._time_step)
 
-        angles = list(self._model.kinematics.space.angles)
         point = np.concatenate([x, outputs], axis=-1)
-        _, slopes = _central_differences(values, point, angles)
+        _, slopes = _central_differences(
+            values, point, self._angles, wrapped_values=self._angles
+        )
         return slopes[..., :n], slopes[..., n:]
 
     def _outputs(
@@ -160,25 +165,21 @@ class LogLinearizer:
         by_features = np.zeros((K, o, d))
         by_memory = np.zeros((K, o, s))
         V = np.zeros((K, o, o))
+        regressor_slopes = self._regressor_slopes(local.features, memory)
         if model.weights.size:
             learned += regressors @ model.weights.T
-            by_regressors = model.weights
-            by_features += by_regressors @ self._maps.regressors_by_features
-            by_memory += by_regressors @ self._maps.regressors_by_memory
-            if model.memory.products is not None:
-                of_products = model.weights[:, self._maps.products]
-                slopes = model.memory.product_slopes(local.features, memory)
-                by_features += of_products @ slopes[0]
-                by_memory += of_products @ slopes[1]
+            by_features += model.weights @ regressor_slopes.by_features
+            by_memory += model.weights @ regressor_slopes.by_memory
         for gp in model.gps:
             prediction = _gp_prediction(gp, local.features, regressors, covariance)
             rows = list(gp.outputs)
             learned[:, rows] += prediction.mean
             if gp.sees_memory:
-                to_regressors = self._maps.regressors_by_features[:-1]
-                by_features[:, rows] += prediction.A @ to_regressors
-                to_memory = self._maps.regressors_by_memory[:-1]
-                by_memory[:, rows] += prediction.A @ to_memory
+                # a GP sees all regressors but the constant
+                seen_by_features = regressor_slopes.by_features[..., :-1, :]
+                seen_by_memory = regressor_slopes.by_memory[..., :-1, :]
+                by_features[:, rows] += prediction.A @ seen_by_features
+                by_memory[:, rows] += prediction.A @ seen_by_memory
             else:
                 by_features[:, rows] += prediction.A
             if prediction.covariance is not None:
@@ -192,6 +193,22 @@ class LogLinearizer:
             by_memory=by_memory,
             covariance=V,
         )
+
+    def _regressor_slopes(self, features: Array, memory: Array) -> "_RegressorSlopes":
+        """Returns the derivatives of the regressors at features (K, d), s (K, s)."""
+        by_features = self._maps.regressors_by_features
+        by_memory = self._maps.regressors_by_memory
+        products = self._maps.products
+        if products.start == products.stop:
+            return _RegressorSlopes(by_features, by_memory)
+        K = len(features)
+        slopes = _RegressorSlopes(
+            np.tile(by_features, (K, 1, 1)), np.tile(by_memory, (K, 1, 1))
+        )
+        of_products = self._model.memory.product_slopes(features, memory)
+        slopes.by_features[:, products] = of_products[0]
+        slopes.by_memory[:, products] = of_products[1]
+        return slopes
 
 
 class _Point(NamedTuple):
@@ -212,6 +229,13 @@ class _LocalOutputs(NamedTuple):
     learned_by_point: Array  # of what they add (K, o, n + m)
     by_memory: Array  # of both, by s (K, o, s)
     covariance: Array  # of the GPs (K, o, o)
+
+
+class _RegressorSlopes(NamedTuple):
+    """Derivatives of the regressors, at K points where there are products."""
+
+    by_features: Array  # (r, d) or (K, r, d)
+    by_memory: Array  # (r, s) or (K, r, s)
 
 
 class _NextSlopes(NamedTuple):
@@ -333,23 +357,29 @@ def _matrix(function: Callable[[Array], Array], size: int) -> Array:
 
 
 def _central_differences(
-    function: Callable[[Array], Array], points: Array, angles: list[int] | None = None
+    function: Callable[[Array], Array],
+    points: Array,
+    angles: Sequence[int],
+    wrapped_values: Sequence[int] = (),
 ) -> tuple[Array, Array]:
     """Returns the values (K, v) and the slopes (K, v, p) of a function.
 
     Args:
         function: Of points (..., K, p).
         points: (K, p).
-        angles: Indices of the values that are wrapped.
+        angles: Indices of the points' entries that are angles.
+        wrapped_values: Indices of the values that are wrapped.
     """
     p = points.shape[1]
-    h = DIFFERENCE * np.maximum(np.abs(points), 1.0)  # (K, p)
+    sizes = np.maximum(np.abs(points), 1.0)
+    sizes[:, list(angles)] = 1.0
+    h = DIFFERENCE * sizes  # (K, p)
     directions = np.concatenate([np.zeros((1, p)), np.eye(p), -np.eye(p)])
     values = function(points + directions[:, None] * h)  # (1 + 2 p, K, v)
     differences = values[1 : 1 + p] - values[1 + p :]
-    if angles:
-        wrapped = differences[..., angles]
-        differences[..., angles] = wrapped - 2 * np.pi * np.round(wrapped / (2 * np.pi))
+    if wrapped_values:
+        columns = list(wrapped_values)
+        differences[..., columns] = wrap(differences[..., columns])
     slopes = differences / (2 * h.T[..., None])
     return values[0], np.moveaxis(slopes, 0, -1)
 

@@ -428,7 +428,7 @@ def train_residual(
         state_dim=n,
         input_dim=m,
     )
-    check_derivatives(nominal, B, transitions)
+    check_derivatives(nominal, B, transitions, features.angles)
     data = residual_data(
         nominal=nominal,
         B=B,

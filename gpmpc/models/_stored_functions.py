@@ -35,7 +35,7 @@ OPERATIONS = "operations"
 CODE_KINDS = ("function", "partial", "dataclass", CASADI_BY_NAME)
 _RULE = (
     "It can be saved as a function of a module, a functools.partial of one with "
-    "keyword arguments, a dataclass of numbers with __call__, or a CasadiFunction of "
+    "keyword arguments, a dataclass with __call__, or a CasadiFunction of "
     "expressions"
 )
 
@@ -61,7 +61,8 @@ def describe_function(
     """Returns the header and the tensors of a function.
 
     Raises:
-        UnsupportedModel: It is code that cannot be imported by a path.
+        UnsupportedModel: It is code that cannot be imported by a path, or a parameter
+            of it is none that JSON gives back as it was.
     """
     tape = function.tape if isinstance(function, CasadiFunction) else None
     if tape is not None and np.isfinite(tape.constants).all():
@@ -79,10 +80,17 @@ def describe_function(
     module = getattr(code.source, "__module__", "")
     path = f"{module}:{getattr(code.source, '__qualname__', '')}"
     is_importable = not path.startswith("__main__") and _imported(path) is code.source
-    holds_tensors = any(isinstance(v, Tensor) for v in code.parameters.values())
-    if not is_importable or holds_tensors:
+    if not is_importable or not _is_of_kind(code.kind, code.source):
         rule = f"{key} is code that a file cannot name"
         raise UnsupportedModel(f"{rule}: {function!r}. {_RULE}")
+    for name, value in code.parameters.items():
+        if not _is_kept_by_json(value):
+            rule = f"{key} has a parameter that a file would change"
+            kinds = (
+                "numbers and texts, lists of them, dictionaries whose keys are texts"
+            )
+            got = f"{name}={value!r:.80} ({type(value).__name__})"
+            raise UnsupportedModel(f"{rule}: {got}. It can be {kinds}")
     return {"kind": code.kind, "path": path, "parameters": code.parameters}, {}
 
 
@@ -95,6 +103,24 @@ def _code(function: Any) -> _Code:
         parameters = {name: getattr(function, name) for name in names}
         return _Code("dataclass", type(function), parameters)
     return _Code("function", function, {})
+
+
+def _is_of_kind(kind: str, source: Any) -> bool:
+    """Whether an object is what functions of a kind are made of."""
+    if kind == "dataclass":
+        return isinstance(source, type) and is_dataclass(source)
+    return type(source) is FunctionType
+
+
+def _is_kept_by_json(value: Any) -> bool:
+    """Whether a value comes back from JSON as it was, types within it included."""
+    if isinstance(value, list):
+        return all(_is_kept_by_json(entry) for entry in value)
+    if isinstance(value, dict):
+        has_texts_as_keys = all(type(name) is str for name in value)
+        return has_texts_as_keys and all(map(_is_kept_by_json, value.values()))
+    # NumPy's float64 is a float
+    return isinstance(value, float) or type(value) in (bool, int, str, type(None))
 
 
 def check_code_name(path: Path, key: str, name: Any, trusted: Sequence[str]) -> None:
@@ -169,11 +195,7 @@ def _function_of_code(
     if not isinstance(parameters, dict):
         raise DataError(f"{key} has no parameters by name")
     source = _imported(name) if name in MODEL_CODE else trusted_code(name, trusted)
-    if kind == "dataclass":
-        is_of_kind = isinstance(source, type) and is_dataclass(source)
-    else:
-        is_of_kind = type(source) is FunctionType
-    if not is_of_kind:
+    if not _is_of_kind(kind, source):
         raise DataError(f"{key} {name!r} is no {kind} that can be imported here")
     if kind == "function":
         return source

@@ -633,6 +633,7 @@ def test_the_bound_is_gpytorchs():
 
 def test_sparse_models_over_other_points_are_refused():
     x, y = data(20)
+    exact = Model(x, y[1], RBFKernel()).double().eval()
     models = []
     for a in range(2):
         likelihood = GaussianLikelihood()
@@ -640,5 +641,7 @@ def test_sparse_models_over_other_points_are_refused():
         models.append(Model(x, y[a], kernel, likelihood=likelihood).double().eval())
     with pytest.raises(ShapeError, match="the same inducing points"):
         from_gpytorch(models, input_dim=1)
+    with pytest.raises(ShapeError, match="all outputs must be sparse"):
+        from_gpytorch([models[0], exact], input_dim=1)
     with pytest.raises(UnsupportedModel, match="freeze it by from_gpytorch"):
         KernelPosterior.from_gpytorch(models[0], input_dim=1, predicts="value")

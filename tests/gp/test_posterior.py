@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError
-from gpmpc.gp import GPPosterior, Scaling, exact_inference, to_gpytorch
+from gpmpc.gp import GPPosterior, Scaling, exact_inference, from_gpytorch, to_gpytorch
 
 
 def posterior(size=30, n=2, m=1, predicts="next_state", seed=0):
@@ -38,6 +38,14 @@ def test_predictions_are_gpytorchs_at_every_size(size):
     ours = gp.predict(states, inputs)
     assert torch.allclose(ours.mean, theirs.mean.T, rtol=0, atol=1e-10)
     assert torch.allclose(ours.variance, theirs.variance.T, rtol=0, atol=1e-10)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_a_model_of_gpytorch_is_where_its_posterior_is():
+    gp = posterior(10).to("cuda")
+    again = from_gpytorch(to_gpytorch(gp), input_dim=gp.input_dim)
+    assert again.device == gp.device
+    assert torch.allclose(again.weights, gp.weights)
 
 
 def test_a_difference_model_adds_the_state():

@@ -160,7 +160,8 @@ def test_misuse_is_refused_with_the_rule():
 
 def test_a_window_of_another_model_says_what_takes_one():
     with pytest.raises(
-        UnsupportedModel, match="ResidualModel.append takes one.; got ResidualModel"
+        UnsupportedModel,
+        match="must be a GPPosterior; got ResidualModel .* ResidualModel.append takes",
     ):
         SlidingWindow(3)(residual_model(), transitions(2))
     with pytest.raises(

@@ -38,19 +38,19 @@ BODY = StateSpace(
 )
 
 
-def dynamics(kinematics, nominal, theta, inputs, dim, **model):
+def dynamics(kinematics, nominal, theta, inputs, dim, sees_memory=False, **model):
     """What ``load_flyable`` would return, with a GP on the last output."""
     rng = np.random.default_rng(0)
     o = len(kinematics.output_names)
     z = torch.from_numpy(rng.normal(size=(20, dim)))
     y = torch.from_numpy(rng.normal(size=(20, 1)))
     one = torch.ones(1, dtype=torch.float64)
+    lengthscales = dim**0.5 * torch.ones(1, dim, dtype=torch.float64)
     gp = GPPosterior.from_hyperparameters(
-        z, y, 2 * torch.ones(1, dim, dtype=torch.float64), one, 0.1 * one, 0, "value"
+        z, y, lengthscales, one, 0.1 * one, 0, "value"
     )
-    whole = LogModel(
-        kinematics, nominal, theta, (0,) * o, gps=(OutputGP((o - 1,), gp),), **model
-    )
+    gps = (OutputGP((o - 1,), gp, sees_memory),)
+    whole = LogModel(kinematics, nominal, theta, (0,) * o, gps=gps, **model)
     noise = OutputNoise(np.ones((4, o)), np.ones(kinematics.space.error_dim))
     return LogDynamics(whole, inputs, 0.02, noise)
 
@@ -79,6 +79,10 @@ def test_what_was_learned_obeys_the_protocol_of_models():
     )  # a turn is counted, not taken back
     check_model(turning, states, torch.ones(2, 1, dtype=torch.float64))
     assert abs(turning.predict(states, states[:, :1]).mean - states).max() < 0.1
+    x = np.array([[0.7, 1.0]])
+    turned = x + np.array([2 * np.pi * 20_000, 0.0])
+    slopes = turning.linearize(turned, np.ones((1, 1))).A
+    np.testing.assert_allclose(slopes, turning.linearize(x, np.ones((1, 1))).A, 1e-6)
 
 
 def test_what_no_controller_can_plan_with_is_named():
@@ -138,7 +142,8 @@ def test_parts_that_all_stand_still_are_named_and_a_known_system_moves():
     assert without_gps(Own(), space).state_dim == 2
 
 
-def test_a_model_with_a_past_has_it_in_its_state():
+@pytest.mark.parametrize("sees_memory", [False, True])
+def test_a_model_with_a_past_has_it_in_its_state(sees_memory):
     space = StateSpace((StateGroup("x", ("x", "y"), ""),))
     kinematics = Increments(space)
     products = Products(rows=2, degree=3, low=(-9.0,) * 3, high=(9.0,) * 3)
@@ -146,7 +151,8 @@ def test_a_model_with_a_past_has_it_in_its_state():
     rng = np.random.default_rng(2)
     regressors = memory.regressor_dim(3, 2)
     model = dynamics(
-        kinematics, AffineNominal(kinematics, fitted=False), np.empty(0), 1, 3,
+        kinematics, AffineNominal(kinematics, fitted=False), np.empty(0), 1,
+        dim=regressors - 1 if sees_memory else 3, sees_memory=sees_memory,
         lag=1, time_constants=np.array([0.05]), memory=memory,
         weights=0.1 * rng.normal(size=(2, regressors)),
     )  # fmt: skip

@@ -297,6 +297,11 @@ def test_code_without_a_path_that_leads_to_it_is_refused(tmp_path, monkeypatch):
         UnsupportedModel, match="nominal is code that a file cannot name"
     ):
         save_model(with_effect(lambda x, u: x), tmp_path / "m")
+    cached = functools.lru_cache(pendulum)  # under the name of what it wraps
+    monkeypatch.setitem(globals(), "pendulum", cached)
+    with pytest.raises(UnsupportedModel, match="nominal is code that a file cannot"):
+        save_model(with_effect(cached), tmp_path / "m")
+    monkeypatch.undo()
     save_model(with_effect(), tmp_path / "m")
     # a table is no operation that a file holds
     x = casadi.MX.sym("x", 2)
@@ -312,6 +317,30 @@ def test_code_without_a_path_that_leads_to_it_is_refused(tmp_path, monkeypatch):
     monkeypatch.delitem(globals(), "rotation")
     with pytest.raises(DataError, match="rotation cannot be imported here"):
         load_model(tmp_path / "m", trusted=["tests"])
+
+
+@pytest.mark.parametrize(
+    ("value", "got"),
+    [
+        ({0: 0.3}, r"\{0: 0.3\} \(dict\)"),
+        ((0.3,), r"\(0.3,\) \(tuple\)"),
+        ([[(0.3,)]], r"\[\[\(0.3,\)\]\] \(list\)"),
+        (np.ones(1), r"array\(\[1.\]\) \(ndarray\)"),
+        (Damped(0.3), r"Damped.* \(Damped\)"),
+    ],
+)
+def test_parameters_that_a_file_would_change_are_refused(value, got, tmp_path):
+    model = with_effect(Damped(0.3))
+    changed = dataclasses.replace(
+        model, nominal=functools.partial(pendulum, damping=value)
+    )
+    with pytest.raises(UnsupportedModel, match=f"nominal has .* damping={got}"):
+        save_model(changed, tmp_path / "m")
+    kept = {"a": [1, 0.5, None, True, "text", np.float64(0.1)]}
+    kept = functools.partial(pendulum, damping=kept)
+    save_model(dataclasses.replace(model, nominal=kept), tmp_path / "m")
+    loaded = load_model(tmp_path / "m", trusted=["tests"])
+    assert loaded.nominal.keywords == kept.keywords
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,17 @@ from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.estimation import Measurement
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
-from gpmpc.gp import GPPosterior, SlidingWindow, SparseTrainer, Trainer, Transitions
+from gpmpc.gp import (
+    GPPosterior,
+    SlidingWindow,
+    SparseTrainer,
+    Trainer,
+    Transitions,
+    append_points,
+    append_transitions,
+    remove_points,
+    to_gpytorch,
+)
 from gpmpc.models import (
     Affine,
     DelayedModel,
@@ -356,6 +366,35 @@ def test_models_are_equal_to_themselves_alone():
         assert part in [replace(part), part]
         assert part != replace(part)
         assert len({part, replace(part)}) == 2
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda model: append_transitions(model, transitions(3)),
+        lambda model: append_points(model, torch.zeros(2, 3), torch.zeros(2, 2)),
+        lambda model: remove_points(model, [0]),
+        to_gpytorch,
+    ],
+)
+def test_a_residual_model_is_not_taken_for_its_gps(change):
+    rule = "posterior must be a GPPosterior; got ResidualModel .*its `residual`"
+    with pytest.raises(UnsupportedModel, match=rule):
+        change(model())
+
+
+def test_a_nominal_is_followed_at_an_angle_of_many_turns():
+    def nominal(x, u):
+        rate = x[:, 1] - 0.5 * x[:, 0].sin() + u[:, 0]
+        return torch.stack([x[:, 0] + 0.05 * x[:, 1], rate, x[:, 2]], dim=-1)
+
+    data = transitions(10)
+    turned = data.states + 2 * torch.pi * torch.tensor([5000.0, 0.0, 0.0])
+    data = replace(data, states=turned, next_states=nominal(turned, data.inputs))
+    trained = ResidualModel.train(
+        nominal, data, angles=[0], trainer=Trainer(restarts=0)
+    )
+    assert trained.angles == [0]
 
 
 def test_an_effect_that_torch_loses_a_part_of_is_refused():
