@@ -184,13 +184,15 @@ def nearest_positive_semidefinite(covariance: Tensor) -> tuple[Tensor, Tensor]:
         DataError: An entry is not finite.
     """
     symmetric = (covariance + covariance.mT) / 2
-    if constant_arrays(symmetric) is not None:  # the usual case, cheaply
+    constants = constant_arrays(symmetric)
+    values = constants or constant_arrays(symmetric.detach())
+    # asked first: an infinite variance has a Cholesky factor
+    if values is not None and not np.isfinite(values[0]).all():
+        raise DataError(f"a predicted covariance must be finite; got {values[0]}")
+    if constants is not None:  # the usual case, cheaply
         failed = torch.linalg.cholesky_ex(symmetric).info.any()
         if not bool(failed):
             return symmetric, torch.zeros_like(symmetric[..., 0, 0])
-    arrays = constant_arrays(symmetric.detach())
-    if arrays is not None and not np.isfinite(arrays[0]).all():
-        raise DataError(f"a predicted covariance must be finite; got {arrays[0]}")
     deficit = (-torch.linalg.eigvalsh(symmetric.detach())[..., 0]).clamp_min(0)
     negative = deficit[..., None, None] > 0
     # The derivative of eigh divides by differences of eigenvalues; where nothing is

@@ -111,9 +111,9 @@ class Linearization(NoisyPropagator):
     def first_order(self) -> bool:
         """Whether the model's numbers at the belief's mean are all that is needed.
 
-        Not of a subclass that propagates in another way.
+        Not of a subclass that propagates in another way, or the variances alone.
         """
-        return holds_for(self, "first_order")
+        return not self.diagonal and holds_for(self, "first_order")
 
     def differentiate(
         self, model: Any, belief: Gaussian, input: Tensor | None = None
@@ -144,7 +144,7 @@ class Linearization(NoisyPropagator):
             + by_input.transpose(-3, -2)
             + on_diagonal(expansion.variance_by_input),
         )
-        return self._add_noise_and_project(model, moments), sensitivity
+        return self._complete_step(model, moments, sensitivity)
 
     def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
         prediction, A, _ = predict_with_jacobian(model, belief.mean, input)

@@ -83,6 +83,7 @@ def linearize(
             f"a local model needs an output a state; got {belief.dim} states, "
             f"{model.output_dim} outputs"
         )
+    check_next_states(model)
     with torch.no_grad():
         expansion = expand_belief(propagator, model, belief, input)
     A = expansion.A

@@ -73,10 +73,8 @@ class MomentMatching(NoisyPropagator):
         form = _exact_form(model)
         f, df = self._latent_moments_with_jacobian(form, belief, input)
         sensitivity = _derivatives(form, belief.covariance, input.shape[-1], f, df)
-        if self.diagonal:
-            sensitivity = _of_diagonal(sensitivity)
         next_moments = _through_affine_part(form, belief, input, f)
-        return self._add_noise_and_project(model, next_moments), sensitivity
+        return self._complete_step(model, next_moments, sensitivity)
 
     def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
         form = _exact_form(model)
@@ -312,19 +310,6 @@ def _with_transpose(B: Tensor | None, AS: Tensor, dJ: Tensor) -> Tensor:
     if B is not None:
         product = torch.einsum("ja,...aic->...jic", B, product)
     return product + product.transpose(-3, -2)
-
-
-def _of_diagonal(sensitivity: Sensitivity) -> Sensitivity:
-    """Returns derivatives whose covariance keeps its diagonal only."""
-    by_mean = sensitivity.covariance_by_mean
-    eye = torch.eye(by_mean.shape[-2], dtype=by_mean.dtype, device=by_mean.device)
-    eye = eye[..., None]
-    return replace(
-        sensitivity,
-        covariance_by_mean=eye * by_mean,
-        covariance_by_covariance=eye[..., None] * sensitivity.covariance_by_covariance,
-        covariance_by_input=eye * sensitivity.covariance_by_input,
-    )
 
 
 def _extend(derivative: Tensor, places: list[int] | None, size: int) -> Tensor:

@@ -54,9 +54,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from gpmpc.exceptions import DataError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
 
+_LinAlgError = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
 _LARGEST_DELTA = {torch.float64: 300.0, torch.float32: 80.0}
 #: numbers in the largest array that is made at once, for one pair of outputs at least
 _LARGEST_SIZE = 2**18
@@ -217,7 +219,13 @@ def _factorize(S: Tensor, D: Tensor) -> _Factorized:
     B = root[..., :, None] * S * root[..., None, :]
     eye = torch.eye(B.shape[-1], dtype=B.dtype, device=B.device)
     half_logdet = torch.linalg.eigvalsh(B).log1p().sum(-1) / 2
-    factor = torch.linalg.cholesky(B + eye)
+    try:
+        factor = torch.linalg.cholesky(B + eye)
+    except _LinAlgError as error:
+        raise DataError(
+            "the belief's covariance must be positive semidefinite; in units of the "
+            "length-scales it has an eigenvalue below -1"
+        ) from error
     T = torch.cholesky_solve(B, factor) / (root[..., :, None] * root[..., None, :])
     return _Factorized(half_logdet=half_logdet, factor=factor, T=T)
 

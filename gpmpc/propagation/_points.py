@@ -13,7 +13,9 @@ Where outputs are angles, whole turns are counted before values are averaged: th
 of 3.1 and -3.1 rad is pi, not 0. An output that is a state, now or a step later, is
 expected to differ from its value at the mean by as much as the point does; any other by
 nothing. Values come within half a turn of what is expected. So a wide belief over an
-angle stays wide, whether the model wraps or not.
+angle stays wide, whether the model wraps or not. Values that spread over more than a
+turn, both by themselves and beside what is expected, are wrapped nowhere: these turns
+are real, as of a heading under a wide belief over its rate, and stay.
 
 Monte Carlo: the reference for every other. Its standard error falls as one over the
 root of the number of samples.
@@ -53,11 +55,13 @@ from gpmpc.propagation._propagator import (
 )
 
 _log = logging.getLogger(__name__)
-# spread of sigma points below which their weights, about 1 / alpha^2, leave no digits
 _LEAST_ALPHA = 1e-7
+# n + lambda below which the weights of sigma points, about one over it, leave no digits
+_LEAST_SPREAD = _LEAST_ALPHA**2
 # samples of all beliefs of a batch that are predicted at once: a GP's points' kernels
 # at them are as many times N * outputs numbers, by torch times n + m
 _CHUNK = 1000
+_ROUND_OFF = 1e-6  # of a turn that wrapped angles may spread over
 # part of the points that may lie further than a quarter turn from the first before the
 # log says that turns may be miscounted
 _FAR_POINTS = 0.01
@@ -99,7 +103,7 @@ class Unscented(NoisyPropagator):
 
     Raises:
         SettingError: alpha is below 1e-7, or (at the first step) n + kappa is not
-            positive.
+            positive, or alpha^2 (n + kappa) below 1e-14.
 
     >>> import torch
     >>> from gpmpc.gaussian import Gaussian
@@ -157,7 +161,7 @@ class Unscented(NoisyPropagator):
             covariance_by_input=by_covariance.input,
         )
         moments = self._moments(model, belief, points.steps, expansion.belief)
-        return self._add_noise_and_project(model, moments), sensitivity
+        return self._complete_step(model, moments, sensitivity)
 
     def _derivatives(
         self, n: int, expansion: SecondOrderExpansion
@@ -201,7 +205,11 @@ class Unscented(NoisyPropagator):
             raise SettingError(
                 "kappa", f"n + kappa must be positive; got {n} states and {self.kappa}"
             )
-        return self.alpha**2 * (n + self.kappa)
+        spread = self.alpha**2 * (n + self.kappa)
+        if spread < _LEAST_SPREAD:
+            rule = "alpha^2 (n + kappa) must be 1e-14 or more"
+            raise SettingError("kappa", f"{rule}; got {spread:.3g} of {n} states")
+        return spread
 
     def _weights(self, like: Tensor, n: int) -> _Weights:
         """Returns the weights of the points in the mean and in the covariance."""
@@ -367,12 +375,23 @@ def _with_turns(values: Tensor, centre: Tensor, steps: Tensor, model: Any) -> Te
         expected = torch.zeros_like(deviations)
     else:
         expected = steps[..., [states[a] for a in angles]]
-    turns = whole_turns(deviations - expected)
+    unexpected = deviations - expected
+    is_counted = _spreads_over_a_turn(deviations) & _spreads_over_a_turn(unexpected)
+    turns = whole_turns(unexpected).masked_fill(is_counted, 0.0)
     if states is None:
         _warn_of_wide_angles(deviations - turns, type(model).__name__)
     counted = values.clone()
     counted[..., angles] = values[..., angles] - turns
     return counted
+
+
+def _spreads_over_a_turn(angles: Tensor) -> Tensor:
+    """Whether angles (*batch, points, a) spread farther than wrapped ones can.
+
+    The answers are (*batch, 1, a).
+    """
+    spread = angles.amax(dim=-2, keepdim=True) - angles.amin(dim=-2, keepdim=True)
+    return spread > TURN * (1 + _ROUND_OFF)
 
 
 def _states_of_outputs(model: Any) -> Sequence[int] | None:

@@ -1,6 +1,6 @@
 """Propagates a Gaussian belief over the state through a model, with derivatives."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -106,7 +106,7 @@ class Propagator(Protocol):
             ShapeError: Belief or input do not fit the model.
             SettingError: Their dtype or device is another one.
             DataError: An entry is not finite, or the covariance is not positive
-                semidefinite; or the predicted covariance is not finite.
+                semidefinite; or the predicted mean or covariance is not finite.
             UnsupportedModel: There is no formula for this model.
         """
         ...
@@ -158,11 +158,35 @@ class NoisyPropagator(Propagator):
         if self.diagonal:
             covariance = torch.diag_embed(covariance.diagonal(dim1=-2, dim2=-1))
         covariance, deficit = nearest_positive_semidefinite(covariance)
+        means = constant_arrays(moments.mean.detach())
+        if means is not None:
+            _check_finite("a predicted mean", means[0])
         return Propagation(
             belief=Gaussian(moments.mean, covariance),
             cross_covariance=moments.cross_covariance,
             deficit=deficit,
         )
+
+    def _complete_step(
+        self, model: Any, moments: NextMoments, sensitivity: Sensitivity
+    ) -> tuple[Propagation, Sensitivity]:
+        """Finishes a step as ``propagate`` does, and its derivatives likewise."""
+        if self.diagonal:
+            sensitivity = _of_diagonal(sensitivity)
+        return self._add_noise_and_project(model, moments), sensitivity
+
+
+def _of_diagonal(sensitivity: Sensitivity) -> Sensitivity:
+    """Returns derivatives whose covariance keeps its diagonal only."""
+    by_mean = sensitivity.covariance_by_mean
+    eye = torch.eye(by_mean.shape[-2], dtype=by_mean.dtype, device=by_mean.device)
+    eye = eye[..., None]
+    return replace(
+        sensitivity,
+        covariance_by_mean=eye * by_mean,
+        covariance_by_covariance=eye[..., None] * sensitivity.covariance_by_covariance,
+        covariance_by_input=eye * sensitivity.covariance_by_input,
+    )
 
 
 @explains_arguments
@@ -181,6 +205,8 @@ def differentiate(
         What ``propagator.propagate`` returns, and the derivatives. Where the covariance
         had to be projected, a closed form gives those of the matrix that was projected,
         and autograd, for models without a closed form, those of the projection.
+        Derivatives of these derivatives by the covariance lack those of its square
+        root, of which ``Unscented`` and ``MonteCarlo`` take their points.
 
     >>> import torch
     >>> from gpmpc.gaussian import Gaussian
@@ -209,7 +235,7 @@ def holds_for(propagator: Any, name: str) -> bool:
 
     A subclass that propagates in another way inherits what is no longer true.
     """
-    if name in vars(propagator):
+    if name in getattr(propagator, "__dict__", {}):
         return True
     for owner in type(propagator).__mro__:
         if name in vars(owner):

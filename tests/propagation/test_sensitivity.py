@@ -58,6 +58,16 @@ MODELS = {
     "autonomous": model(n=3, m=0, predicts="difference"),
     "residual": residual_model(),
 }
+
+
+class IndependentOutputs(Linearization):
+    diagonal = True
+
+
+class IndependentPoints(Unscented):
+    diagonal = True
+
+
 PROPAGATORS = [
     MeanEquivalence(),
     Linearization(),
@@ -67,6 +77,8 @@ PROPAGATORS = [
     MomentMatching(process_noise=True),
     Unscented(),
     Unscented(alpha=0.5, beta=2.0, kappa=1.0, process_noise=True),
+    IndependentOutputs(),
+    IndependentPoints(),
 ]
 
 
@@ -329,9 +341,14 @@ class DoubledVariance(Linearization):
         return moments._replace(covariance=2.0 * moments.covariance)
 
 
-class OnlyPropagates:
+class WithoutAttributes:
+    __slots__ = ()
+
     def propagate(self, model, belief, input=None):
         return Linearization().propagate(model, belief, input)
+
+    def differentiate(self, model, belief, input=None):
+        return Linearization().differentiate(model, belief, input)
 
 
 def test_a_propagator_of_ones_own_is_taken_by_its_word():
@@ -340,13 +357,16 @@ def test_a_propagator_of_ones_own_is_taken_by_its_word():
     own = DoubledVariance(process_noise=False)
     assert Linearization().first_order
     assert not own.first_order
+    assert not IndependentOutputs().first_order
     propagation, slopes = differentiate(own, gp, belief(3), control)
     expected, closed = differentiate(Linearization(False), gp, belief(3), control)
     covariance = 2.0 * expected.belief.covariance
     assert torch.allclose(propagation.belief.covariance, covariance)
     assert torch.allclose(slopes.covariance_by_mean, 2.0 * closed.covariance_by_mean)
+    stepped, _ = differentiate(WithoutAttributes(), gp, belief(3), control)
+    assert torch.equal(stepped.belief.mean, expected.belief.mean)
     inputs = torch.zeros(2, 2)
-    beliefs = rollout(OnlyPropagates(), gp, belief(3), inputs)
+    beliefs = rollout(WithoutAttributes(), gp, belief(3), inputs)
     assert torch.equal(
         beliefs.mean, rollout(Linearization(), gp, belief(3), inputs).mean
     )
@@ -362,6 +382,21 @@ def test_misuse_is_refused_by_a_rule():
     for propagator in (Linearization(), Unscented()):
         with pytest.raises(DataError, match="a predicted covariance must be finite"):
             propagator(broken, Gaussian(torch.zeros(2), torch.eye(2)))
+    steep = KnownModel(lambda x, u: 1e200 * x, 1, 0)
+    with pytest.raises(DataError, match=r"covariance must be finite; got \[\[inf\]\]"):
+        Linearization()(steep, Gaussian(torch.zeros(1), torch.eye(1)))
+    undefined = KnownModel(lambda x, u: x.log(), 1, 0)
+    below = Gaussian(-torch.ones(1), 0.01 * torch.eye(1))
+    for propagator in (MeanEquivalence(), Linearization()):
+        with pytest.raises(
+            DataError, match=r"a predicted mean must be finite; got \[nan"
+        ):
+            propagator(undefined, below)
+    with pytest.raises(SettingError, match="next state; got GPs with predicts='value'"):
+        linearize(MomentMatching(), values, belief(2), torch.zeros(1))
+    nearly = torch.tensor([[1.0, 1 + 1e-9], [1 + 1e-9, 1.0]])
+    with backend("torch"), pytest.raises(DataError, match="must be positive semidef"):
+        MomentMatching()(model(m=0, lengthscale=1e-5), Gaussian(torch.zeros(2), nearly))
 
 
 @pytest.mark.parametrize("choice", ["auto", "torch"])
