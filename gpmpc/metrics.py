@@ -171,6 +171,8 @@ class _ViolationRate:
     violations: int  #: steps at which any entry was outside
     steps: int  #: all of them
     worst: float  #: largest distance outside, in the entry's unit; 0 for none
+    #: likewise of each entry; 0 within the tolerance
+    worst_by_entry: tuple[float, ...]
     low: float  #: lower end of the interval for the probability of a violation
     high: float  #: its upper end
 
@@ -210,11 +212,13 @@ def violation_rate(
     inside = (values >= lower - tolerance) & (values <= upper + tolerance)
     violations = int((~inside.all(axis=1)).sum())
     distances = np.maximum(lower - values, values - upper)
+    farthest = np.fmax.reduce(distances, axis=0, initial=0.0)
     low, high = binomial_interval(violations, len(values))
     return _ViolationRate(
         violations=violations,
         steps=len(values),
-        worst=float(np.fmax.reduce(distances, axis=None, initial=0.0)),
+        worst=float(farthest.max(initial=0.0)),
+        worst_by_entry=tuple(np.where(farthest > tolerance, farthest, 0.0).tolist()),
         low=low,
         high=high,
     )

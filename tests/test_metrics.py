@@ -127,7 +127,7 @@ def test_a_violation_is_a_step_with_any_entry_outside():
     )
     rate = violation_rate(values, [-1.0, -2.0], [1.0, np.inf])
     assert (rate.violations, rate.steps, rate.rate) == (2, 5, 0.4)
-    assert rate.worst == 1.0
+    assert (rate.worst, rate.worst_by_entry) == (1.0, (0.5, 1.0))
     assert rate.low < 0.4 < rate.high
 
 

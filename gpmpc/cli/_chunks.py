@@ -23,7 +23,7 @@ from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.studies._run_folder import Busy, RunFolder
 
 _WORK = 60.0  # of a chunk [s]
-_MOST_WORK = 120.0  # behind which a chunk begins no other run [s]
+_MOST_WORK = 120.0  # after which a chunk begins no other run [s]
 _FIRST = 2  # runs a process in the first round; the first one loads what is compiled
 _MOST_FIRST = 8  # processes in the first round
 _MEASURED = 50  # runs, the last ones, that tell how long others take
@@ -56,7 +56,7 @@ class Chunk:
     """Runs that one process flies, one after another; can be pickled."""
 
     jobs: tuple[Job, ...]
-    #: behind which it begins no other run [s]; None: it flies them all
+    #: after which it begins no other run [s]; None: it flies them all
     most_work: float | None
 
     @property
@@ -147,7 +147,9 @@ class Chunking:
         self._size = None if isinstance(size, str) else size
         self._workers = workers
         # Of the last runs. The first one of each chunk, its leader, takes longer: it
-        # loads and compiles.
+        # loads and compiles. Who led once counts as a leader for ever, also where it
+        # flies again in the midst of a chunk: that is rare, and leaders only count
+        # where no other run has ended.
         self._seconds: deque[float] = deque(maxlen=_MEASURED)
         self._seconds_of_leaders: deque[float] = deque(maxlen=_MEASURED)
         self._leaders: set[RunFolder] = set()

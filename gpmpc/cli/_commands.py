@@ -54,6 +54,9 @@ class Subcommand:
     arguments: Sequence[Argument] = ()
     #: whether it has a file in ``conf/``, whose settings follow its name
     has_settings: bool = False
+    #: whether it takes up its work when it is repeated after an interruption; what
+    #: flies many runs does, too
+    resumes: bool = False
 
     def parser(self, name: str) -> Parser:
         """Returns the parser of what follows the command's name."""
@@ -128,24 +131,28 @@ COMMANDS = {
             *_SETTINGS,
         ],
         has_settings=True,
+        resumes=True,
     ),
     "tables": Subcommand(
         "Computes Tables 1 and 2 of Cao, Lai and Alam (2017)",
         module="_study",
         arguments=_SETTINGS,
         has_settings=True,
+        resumes=True,
     ),
     "figures": Subcommand(
         "Flies figures 2 to 4 and section 5.2, also with the plant in the loop",
         module="_study",
         arguments=_SETTINGS,
         has_settings=True,
+        resumes=True,
     ),
     "quality": Subcommand(
         "Measures closed-loop cost over the time of a decision",
         module="_study",
         arguments=_SETTINGS,
         has_settings=True,
+        resumes=True,
     ),
     "new": Subcommand(
         "Writes a project of your own: a system, its settings, a script and a test",
@@ -287,6 +294,7 @@ COMMANDS = {
     "learn": Subcommand(
         "Learns a model from logs and judges it on held-out runs",
         module="_learn",
+        resumes=True,
         arguments=[
             _argument(
                 "mapping",

@@ -29,13 +29,13 @@ def completion(arguments: argparse.Namespace) -> Result:
 
 def candidates(line: str) -> list[str]:
     """Returns the words that the last word of a line, up to the cursor, may become."""
-    words = line.split()[1:]
-    if line.endswith(" ") or not words:
-        words.append("")
-    name = words[0]
-    before = words[1:-1]
-    word = words[-1]
-    names_a_command = len(words) == 1 or (name == "help" and not before)
+    typed = line.split()[1:]
+    if line.endswith(" ") or not typed:
+        typed.append("")
+    name = typed[0]
+    before = typed[1:-1]
+    word = typed[-1]
+    names_a_command = len(typed) == 1 or (name == "help" and not before)
     if names_a_command:
         choices = [*COMMANDS]
     elif name in COMMANDS:

@@ -23,9 +23,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gpmpc.cli._overrides import Override, read_override
+from gpmpc.cli._overrides import Override, folder_choice, read_override
 from gpmpc.cli._plain_settings import ASIDE, chosen_options, model_fingerprint
-from gpmpc.cli._settings import run_command, search_options, without_hydra
+from gpmpc.cli._settings import config_source_options, run_command, without_hydra
 
 # Such as ${hydra:job.name}, which differs from run to run.
 _OF_HYDRA = re.compile(r"\$\{\s*hydra\s*[:.]")
@@ -46,8 +46,8 @@ class Template:
     fingerprint: str | None
     #: whether the model is that of a file
     reads_model: bool
-    #: by which a command finds the files; see ``search_options``
-    search_options: tuple[str, ...] = ()
+    #: by which a command finds the files; see ``config_source_options``
+    config_source_options: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,8 @@ class ComposedSettings:
     template: Template
     #: key and value, in the order in which they are set
     values: tuple[tuple[str, Any], ...] = ()
+    #: ``folder=TREE`` where the command names one
+    folder_choice: tuple[str, ...] = ()
 
     def config(self) -> DictConfig:
         """Returns the settings, their interpolations not resolved yet."""
@@ -72,7 +74,9 @@ class ComposedSettings:
 
     def command(self, choices: Sequence[str]) -> str:
         """Returns the command that flies the run of these choices."""
-        return run_command(self.template.search_options, choices)
+        return run_command(
+            self.template.config_source_options, [*choices, *self.folder_choice]
+        )
 
     def fingerprint(self) -> str | None:
         """Returns a text that differs where a result may.
@@ -128,7 +132,7 @@ class Composer:
             for override in overrides
             if override.word not in composed_words
         )
-        settings = ComposedSettings(template, values)
+        settings = ComposedSettings(template, values, (*folder_choice(words),))
         keys = tuple(key for key, _ in values)
         if (composed_words, keys) not in self._settable:
             try:
@@ -139,18 +143,24 @@ class Composer:
         return settings
 
     def _composed_words(self, overrides: Sequence[Override]) -> tuple[str, ...]:
-        """Returns the words that Hydra composes; each other one sets a value.
+        """Returns the words that Hydra composes; each other one sets a value."""
+        composed = overrides
+        if not self._order_matters(overrides):
+            composed = [each for each in overrides if not self._sets_value(each)]
+        return tuple(each.word for each in composed)
 
-        They are all words where it may matter in which order settings are changed.
+    def _order_matters(self, overrides: Sequence[Override]) -> bool:
+        """Whether a value that is set would come before or after another change of it.
+
+        Such a change deletes, adds or merges; files are chosen before all values.
         """
-        others = [each for each in overrides if not self._sets_value(each)]
-        changed = [each.name for each in others if not self._chooses_file(each)]
-        for override in overrides:
-            if self._sets_value(override) and any(
-                _overlap(override.name, name) for name in changed
-            ):
-                return tuple(each.word for each in overrides)
-        return tuple(each.word for each in others)
+        values = [each.name for each in overrides if self._sets_value(each)]
+        changed = [
+            each.name
+            for each in overrides
+            if not self._sets_value(each) and not self._chooses_file(each)
+        ]
+        return any(_overlap(name, other) for name in values for other in changed)
 
     def _sets_value(self, override: Override) -> bool:
         asks_hydra = _OF_HYDRA.search(override.choice) is not None
@@ -182,7 +192,8 @@ class Composer:
         """Lets Hydra compose a run, and tell its settings what they ask it for."""
         composed = hydra.compose(self._name, [*words], return_hydra_config=True)
         HydraConfig.instance().set_config(composed)
-        return ComposedSettings(self._template_of(composed, resolved=True))
+        template = self._template_of(composed, resolved=True)
+        return ComposedSettings(template, folder_choice=(*folder_choice(words),))
 
     def _template_of(self, composed: DictConfig, resolved: bool = False) -> Template:
         options = dict(composed.hydra.runtime.choices)
@@ -195,7 +206,7 @@ class Composer:
             options=options,
             fingerprint=_fingerprint(config, options),
             reads_model="path" in (config.get("model") or {}),
-            search_options=search_options(composed.hydra),
+            config_source_options=config_source_options(composed.hydra),
         )
 
 

@@ -54,7 +54,7 @@ def export(arguments: argparse.Namespace) -> Result:
     folder = arguments.to or path.parent / "c"
     with console.status("learning"):
         controller = _controller_of(run, experiment)
-    kept = kept_points(console, controller, experiment, budget, arguments)
+    selection = kept_points(console, controller, experiment, budget, arguments)
     policy: Any = experiment.on_failure
     precision = arguments.precision
     questions = list(_questions(run, experiment, controller))
@@ -64,29 +64,33 @@ def export(arguments: argparse.Namespace) -> Result:
             folder,
             precision,
             policy,
-            points=kept.points,
+            points=selection.points,
             name=arguments.name,
         )
-        steps = write_replay(kept.controller, questions, folder / "replay.txt", policy)
-        _write_points(folder / "points.md", kept, arguments.budget)
+        steps = write_replay(
+            selection.controller, questions, folder / "replay.txt", policy
+        )
+        _write_points(folder / "points.md", selection, arguments.budget)
     header, source = (f"src/{file.name}" for file in export)
     lines = [f"written to {folder}: {header}, {source}, and a replay of {steps} steps"]
-    lines += kept.lines
+    lines += selection.lines
     lines += [
         f"{change}: what is exported is what this code makes of the same settings"
         for change in changes_since(run)
     ]
-    from_flight = _largest_difference(run, answers(kept.controller, questions, policy))
+    from_flight = _largest_difference(
+        run, answers(selection.controller, questions, policy)
+    )
     lines.append(f"beside the flight inputs within {from_flight:.2g}")
     data = {
         "folder": str(folder),
         "steps": steps,
         "difference_from_flight": from_flight,
-        **kept.data,
+        **selection.data,
     }
     if shutil.which("cc"):
         with console.status("compiling"):
-            data |= _measure(kept.controller, questions, precision, policy)
+            data |= _measure(selection.controller, questions, precision, policy)
         lines += [
             f"memory            {data['memory_bytes'] / 1024:.0f} kB of one controller",
             f"a step, here      median {data['median_us']:.0f} us, "
@@ -100,12 +104,12 @@ def export(arguments: argparse.Namespace) -> Result:
     return Result(data)
 
 
-def _write_points(path: Path, kept: KeptPoints, budget: str) -> None:
+def _write_points(path: Path, selection: KeptPoints, budget: str) -> None:
     """Writes how many points are kept; an older page goes where all are."""
-    if kept.points is None:
+    if selection.points is None:
         path.unlink(missing_ok=True)
     else:
-        write_whole(path, kept.document(budget))
+        write_whole(path, selection.document(budget))
 
 
 def _only_recording(path: Path) -> Path:

@@ -45,6 +45,28 @@ class Job(Protocol):
         ...
 
 
+@dataclass
+class _OpenJob:
+    """A job that is not settled yet."""
+
+    job: Job
+    #: when an attempt failed that does not count [ns]; None: every failure counts
+    ignored_failure_at: int | None
+    #: when the last attempt before the launch began [ns]; None: there was none, or an
+    #: adopted chunk has the job, and when that began it is not known
+    begun_at_launch: int | None = None
+
+    @property
+    def path(self) -> str:
+        """Where it is kept."""
+        return str(self.job.folder.path)
+
+    @property
+    def begun_since_launch(self) -> bool:
+        """Whether an attempt was begun since the chunks were started."""
+        return self.job.folder.begun_at != self.begun_at_launch
+
+
 OnSettled = Callable[[Any, RunState], None]  # takes a job, which finished or failed
 
 
@@ -74,11 +96,7 @@ class Flying:
     #: why runs failed whose folders cannot be written, such as on a full disk, by path
     reasons_not_kept: dict[str, str] = field(default_factory=dict)
     _has_launched: bool = False
-    _open: dict[str, Job] = field(default_factory=dict)  # by path, not settled yet
-    # When an attempt failed that does not count, by path; None: each one counts.
-    _failed_before: dict[str, int | None] = field(default_factory=dict)
-    # When the last attempt before the launch began, by path; None: there was none.
-    _begun_before: dict[str, int | None] = field(default_factory=dict)
+    _open: dict[str, _OpenJob] = field(default_factory=dict)  # by path
 
     def fly(self, jobs: Iterable[Any]) -> None:
         """Flies jobs; returns when each is settled."""
@@ -92,15 +110,14 @@ class Flying:
         """Takes a job on, unless it was ended from outside too often."""
         path = str(job.folder.path)
         failed_at = job.folder.failed_at
-        attempts = 0 if failed_at is None else job.folder.lost_attempts
+        attempts = 0 if failed_at is None else job.folder.outside_attempts
         if attempts > self.retries:
             self.given_up[path] = attempts
             self.on_settled(job, RunState.FAILED)
             return
         if attempts:
             self.tried_again.append(path)
-        self._open[path] = job
-        self._failed_before[path] = failed_at
+        self._open[path] = _OpenJob(job, ignored_failure_at=failed_at)
 
     def _fly_once(self) -> bool:
         """Flies the jobs that nobody works on, and settles those that have ended.
@@ -113,19 +130,19 @@ class Flying:
             ends = self._launch(running)
         if ends is None:
             return False
-        adopted = {id(chunk) for chunk in running}
-        unseen: list[tuple[Job, ChunkEnd]] = []
+        unseen: list[tuple[_OpenJob, ChunkEnd]] = []
         for end in ends:
-            if id(end.chunk) in adopted:
-                # It may have failed before this sweep looked.
-                self._failed_before |= dict.fromkeys(_paths(end.chunk))
+            if end.was_adopted:
+                # Its runs may have failed before this sweep looked.
+                for open_job in self._open_jobs(end.chunk):
+                    open_job.ignored_failure_at = None
             if end.cause is not None:
                 self._settle_dead_chunk(end)
                 continue
             unsettled = self._unsettled(end.chunk)
-            # A chunk may stop behind any of its runs, and leave the others.
+            # A chunk may stop after any of its runs, and leave the others.
             if len(unsettled) == len(end.chunk.folders):
-                unseen += [(job, end) for job in unsettled]
+                unseen += [(open_job, end) for open_job in unsettled]
         self._judge_unseen(unseen)
         return True
 
@@ -133,15 +150,15 @@ class Flying:
         """Launches the jobs that nobody works on; None where there is none."""
         in_hand = {path for chunk in running for path in _paths(chunk)}
         to_fly = []
-        for path, job in [*self._open.items()]:
-            # When an adopted chunk began its runs is not known.
-            self._begun_before[path] = None
+        for path, open_job in [*self._open.items()]:
+            open_job.begun_at_launch = None
             if path in in_hand:
                 continue
-            self._begun_before[path] = job.folder.begun_at
-            state = job.folder.state
-            if not self._settle(job) and state is not RunState.RUNNING:
-                to_fly.append(job)
+            folder = open_job.job.folder
+            open_job.begun_at_launch = folder.begun_at
+            state = folder.state
+            if not self._settle(open_job) and state is not RunState.RUNNING:
+                to_fly.append(open_job.job)
         if not to_fly and not in_hand:
             return None
         chunks = self.chunked(to_fly) if to_fly else ()
@@ -152,45 +169,46 @@ class Flying:
         self._has_launched = True
         return ends
 
-    def _unsettled(self, chunk: Chunk) -> list[Job]:
-        """Settles jobs of a chunk; returns those that are not."""
-        jobs = [self._open[path] for path in _paths(chunk) if path in self._open]
-        return [job for job in jobs if not self._settle(job)]
+    def _open_jobs(self, chunk: Chunk) -> list[_OpenJob]:
+        """Returns the jobs of a chunk that are not known to be settled."""
+        return [self._open[path] for path in _paths(chunk) if path in self._open]
 
-    def _settle(self, job: Job) -> bool:
+    def _unsettled(self, chunk: Chunk) -> list[_OpenJob]:
+        """Settles jobs of a chunk; returns those that are not."""
+        return [one for one in self._open_jobs(chunk) if not self._settle(one)]
+
+    def _settle(self, open_job: _OpenJob) -> bool:
         """Takes a job off the list where it has finished, or failed in this call."""
-        path = str(job.folder.path)
-        state = job.folder.outcome_since(self._failed_before[path])
+        job = open_job.job
+        state = job.folder.outcome_since(open_job.ignored_failure_at)
         if state is None:
             return False
-        del self._open[path]
+        del self._open[open_job.path]
         self.on_settled(job, state)
         return True
 
     def _settle_dead_chunk(self, end: ChunkEnd) -> None:
         """Settles what a process left that died, or was ended, before its chunk."""
         _list_folders(end.chunk)
-        lost_jobs = [
-            job
-            for job in self._unsettled(end.chunk)
-            if job.folder.state is not RunState.RUNNING
+        abandoned = [
+            open_job
+            for open_job in self._unsettled(end.chunk)
+            if open_job.job.folder.state is not RunState.RUNNING
         ]
         if end.cause not in _OF_THE_WHOLE_CHUNK:
             # Only runs begun since the launch count; if none had begun, the process
             # died while starting, and all of the chunk count.
-            lost_jobs = [*filter(self._begun_now, lost_jobs)] or lost_jobs
-        for job in lost_jobs:
-            self._lose(job, end)
+            begun = [one for one in abandoned if one.begun_since_launch]
+            abandoned = begun or abandoned
+        for open_job in abandoned:
+            self._end_from_outside(open_job, end)
 
-    def _begun_now(self, job: Job) -> bool:
-        """Whether an attempt was begun since the chunks were started."""
-        return job.folder.begun_at != self._begun_before[str(job.folder.path)]
-
-    def _lose(self, job: Job, end: ChunkEnd) -> None:
+    def _end_from_outside(self, open_job: _OpenJob, end: ChunkEnd) -> None:
         """Makes a job a failed one, or leaves it to be flown again."""
+        job = open_job.job
         cause = end.cause or Cause.ERROR
         # What ends a whole chunk says nothing of runs that were not begun.
-        is_attempt = cause not in _OF_THE_WHOLE_CHUNK or self._begun_now(job)
+        is_attempt = cause not in _OF_THE_WHOLE_CHUNK or open_job.begun_since_launch
         about = {
             "schema": 1,
             "choices": [*job.choices],
@@ -199,56 +217,58 @@ class Flying:
             "provenance": self._provenance,
         }
         try:
-            job.folder.lose(end.reason, cause.value, about, is_attempt)
+            job.folder.end_from_outside(end.reason, cause.value, about, is_attempt)
         except Busy:  # another sweep works on it: its outcome counts
             return
         except OSError as error:
             problem = error.strerror or error
             reason = f"{end.reason} (its folder does not say so: {problem})"
-            self._settle_without_file(job, reason)
+            self._settle_without_file(open_job, reason)
             return
-        path = str(job.folder.path)
-        if cause in _REPEATED and job.folder.lost_attempts <= self.retries:
-            self.repeated.add(path)
-            self._failed_before[path] = job.folder.failed_at
+        if cause in _REPEATED and job.folder.outside_attempts <= self.retries:
+            self.repeated.add(open_job.path)
+            open_job.ignored_failure_at = job.folder.failed_at
             return
-        self._settle(job)
+        self._settle(open_job)
 
-    def _settle_without_file(self, job: Job, reason: str) -> None:
+    def _settle_without_file(self, open_job: _OpenJob, reason: str) -> None:
         """Takes a job off the list that failed, and whose folder cannot say so."""
-        path = str(job.folder.path)
-        self.reasons_not_kept[path] = reason
-        del self._open[path]
-        self.on_settled(job, RunState.FAILED)
+        self.reasons_not_kept[open_job.path] = reason
+        del self._open[open_job.path]
+        self.on_settled(open_job.job, RunState.FAILED)
 
     @cached_property
     def _provenance(self) -> dict[str, Any]:
         """Of all failures that this process writes."""
         return provenance()
 
-    def _judge_unseen(self, unseen: Sequence[tuple[Job, ChunkEnd]]) -> None:
+    def _judge_unseen(self, unseen: Sequence[tuple[_OpenJob, ChunkEnd]]) -> None:
         """Fails the jobs that a process said to be done, and that are not there."""
         deadline = time.monotonic() + _LATE
         while unseen and time.monotonic() < deadline:
             unseen = [
-                (job, end)
-                for job, end in unseen
-                if not self._settle_late(job) and not self._begun_now(job)
+                (open_job, end)
+                for open_job, end in unseen
+                if not self._settle_late(open_job) and not open_job.begun_since_launch
             ]
             if unseen:
                 time.sleep(_LOOK_INTERVAL)
-        for job, end in unseen:
+        for open_job, end in unseen:
             host = end.host or "the process that flew it"
-            reason = f"{host} says that it flew this run, and it is not in the folder; "
-            reason += f"does {host} see {job.folder.path.parent}?"
-            self._lose(job, ChunkEnd(end.chunk, end.host, Cause.ERROR, reason))
+            tree = open_job.job.folder.path.parent
+            reason = (
+                f"{host} says that it flew this run, and it is not in the folder; "
+                f"does {host} see {tree}?"
+            )
+            unseen_end = ChunkEnd(end.chunk, end.host, Cause.ERROR, reason)
+            self._end_from_outside(open_job, unseen_end)
 
-    def _settle_late(self, job: Job) -> bool:
+    def _settle_late(self, open_job: _OpenJob) -> bool:
         """Settles a job after its tree was listed, which shows what others wrote."""
-        os.listdir(job.folder.path.parent)
-        if str(job.folder.path) not in self._open:
+        os.listdir(open_job.job.folder.path.parent)
+        if open_job.path not in self._open:
             return True
-        return self._settle(job)
+        return self._settle(open_job)
 
 
 def _list_folders(chunk: Chunk) -> None:

@@ -22,7 +22,8 @@ def folder_of(folder: Any) -> Path:
 def writing(folder: Path, key: str = "folder") -> Iterator[None]:
     """Turns errors of writing to ``folder`` into one of the setting that named it.
 
-    Errors of other files, such as of data that cannot be read, are raised as they are.
+    Errors that name no file, such as of a full disk, are taken for some of these. Those
+    of other files, such as of data that cannot be read, are raised as they are.
     """
     try:
         yield
@@ -86,6 +87,6 @@ def find_modules_here() -> None:
     of somebody else's runs nothing of it. Hydra, which imports what is called like a
     plugin of its own, has looked for plugins before.
     """
-    here = working_folder()
-    if here not in sys.path:
-        sys.path.append(here)
+    folder = working_folder()
+    if folder not in sys.path:
+        sys.path.append(folder)

@@ -77,6 +77,8 @@ class ChunkEnd:
     cause: Cause | None = None
     #: the cause in a line
     reason: str = ""
+    #: whether another call had launched it, and this one found it running
+    was_adopted: bool = False
 
 
 class Refused(GpmpcError):
@@ -112,14 +114,16 @@ class Launcher(Protocol):
         ...
 
     def running(self, paths: Set[str]) -> Sequence[Chunk]:
-        """Returns chunks of another call whose end nobody has seen yet.
+        """Adopts chunks of another call whose end nobody has seen yet.
 
-        Those with any of the folders ``paths``.
+        They are those with any of the folders ``paths``; ``launch`` tells their ends.
         """
         ...
 
     def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
-        """Starts ``chunks``, and yields how they and the running ones end.
+        """Starts ``chunks``, and yields how they and the adopted ones end.
+
+        Adopted are those that the last call of ``running`` returned.
 
         Some may be left for a later call, where there is no room for all.
 

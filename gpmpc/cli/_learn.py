@@ -154,11 +154,11 @@ def _learn_and_judge(
             text = f"{error} ({folder / _MODEL} is written, without a report)"
             raise DataError(text) from error
         longest = min(arguments.steps, most_steps(learned, held_out, train))
-        told = max(most_told_steps(learned, held_out), 1)
+        told_steps = max(most_told_steps(learned, held_out), 1)
         reason = ""
-        if told < longest:
-            longest = told
-            reason = f": {_of_more_than(told)}"
+        if told_steps < longest:
+            longest = told_steps
+            reason = f": {_of_more_than(longest)}"
         show(f"judging on held-out runs, at most {longest} steps ahead{reason}")
         steps = {step for step in _JUDGED_STEPS if step <= longest} | {longest}
         judgement = logs.judge(learned, held_out, train, sorted(steps))

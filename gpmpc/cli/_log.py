@@ -35,13 +35,13 @@ _SUFFIXES = {
 
 def condition(run: Run) -> str:
     """Says what a recording lacks, and what ended its flight early; else nothing."""
-    parts = []
+    faults = []
     if not run.finished:
         reasons = "; ".join(flaw.text for flaw in run.flaws)
-        parts.append(reasons if run.whole else f"{CUT} ({reasons})")
+        faults.append(reasons if run.whole else f"{CUT} ({reasons})")
     if run.ended_by:
-        parts.append(plain_text(f"the flight ended early: {run.ended_by}"))
-    return "; ".join(parts)
+        faults.append(plain_text(f"the flight ended early: {run.ended_by}"))
+    return "; ".join(faults)
 
 
 def log(arguments: argparse.Namespace) -> Result:

@@ -24,14 +24,14 @@ from gpmpc.parallel import THREADS
 def main() -> None:
     """Runs the command line."""
     flags = {*FLAGS} & {*sys.argv[1:]}
-    words = [word for word in sys.argv[1:] if word not in FLAGS]
+    arguments = [word for word in sys.argv[1:] if word not in FLAGS]
     output = "output"
     if "--json" in flags:
         output = "error"
     if "--quiet" in flags:
         output = "nowhere"
     with redirected_output(output):
-        result = _run(words, as_json="--json" in flags, debug="--debug" in flags)
+        result = _run(arguments, as_json="--json" in flags, debug="--debug" in flags)
     if "--json" in flags:
         from gpmpc.studies._document import json_text
 
@@ -57,7 +57,7 @@ def _run(words: Sequence[str], as_json: bool, debug: bool) -> Result:
         working_folder()
         return _call(command.module, name, arguments)
     except KeyboardInterrupt:
-        if _goes_on_where_it_stopped(name, command, words):
+        if _resumes(command, words):
             advice = "the same command goes on where it stopped"
             raise KeyboardInterrupt(advice) from None
         raise KeyboardInterrupt from None
@@ -154,13 +154,9 @@ def _run_with_settings(
         return _call(command.module, name, config)
 
 
-def _goes_on_where_it_stopped(
-    name: str, command: Subcommand | None, words: Sequence[str]
-) -> bool:
+def _resumes(command: Subcommand | None, words: Sequence[str]) -> bool:
     """Whether a command that was interrupted takes up its work when it is repeated."""
-    if name == "learn":
-        return True
-    if command is None or not command.has_settings:
+    if command is None:
         return False
     is_sweep = "-m" in words or "--multirun" in words
-    return name != "run" or is_sweep
+    return command.resumes or (command.has_settings and is_sweep)

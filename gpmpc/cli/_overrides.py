@@ -1,4 +1,11 @@
-"""Reads the words SETTING=VALUE of a command, each once."""
+"""Reads the words SETTING=VALUE of a command, each once.
+
+word       ``data.size=50``, as it was typed
+override   a word as Hydra reads it: key, value, and what it does
+choices    the overrides of a run that a result depends on; they name its folder
+options    the file that was chosen of each group, such as ``lqr`` of controller
+settings   all of a run, composed of the files and the overrides
+"""
 
 import itertools
 import re
@@ -100,6 +107,16 @@ def choices(overrides: Iterable[str]) -> list[str]:
         if not override.is_aside:
             by_key[override.key] = override.choice
     return sorted(by_key.values())
+
+
+def folder_choice(overrides: Iterable[str]) -> list[str]:
+    """Returns ``folder=TREE`` where overrides name a tree: no choice, but a place."""
+    chosen = [
+        override.choice
+        for override in map(read_override, overrides)
+        if override.name == "folder"
+    ]
+    return chosen[-1:]
 
 
 def combinations(overrides: Sequence[str]) -> Iterator[list[str]]:

@@ -24,9 +24,9 @@ from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import folder_of, writing
 from gpmpc.cli._mistakes import one_line
 from gpmpc.cli._mlflow import log_to_mlflow
-from gpmpc.cli._overrides import choices
+from gpmpc.cli._overrides import choices, folder_choice
 from gpmpc.cli._plain_settings import plain_settings
-from gpmpc.cli._settings import run_command, search_options
+from gpmpc.cli._settings import config_source_options, run_command
 from gpmpc.cli._terminal import OutputEnded, print_error, remarks_to
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.recording import McapRecorder, RecordedSystem
@@ -97,16 +97,21 @@ def run(config: DictConfig) -> Result:
         remarks_to(print_error),
     ):
         # What a user can get wrong is found before anything is written; the objects
-        # that fly are made again in ``_fly``, where an error is kept in the folder.
+        # that fly are made again in ``_fly_and_measure``, where an error is kept in the
+        # folder.
         experiment_of(config)
-        words = choices(HydraConfig.get().overrides.task)
         hydra_settings = HydraConfig.get()
+        overrides = hydra_settings.overrides.task
+        own_choices = choices(overrides)
         to_fly = RunToFly(
             config=config,
             options=hydra_settings.runtime.choices,
-            choices=words,
-            command=run_command(search_options(hydra_settings), words),
-            folder=RunFolder(folder_of(config.folder) / folder_name(words)),
+            choices=own_choices,
+            command=run_command(
+                config_source_options(hydra_settings),
+                [*own_choices, *folder_choice(overrides)],
+            ),
+            folder=RunFolder(folder_of(config.folder) / folder_name(own_choices)),
         )
         outcome = run_one(to_fly, warn=_warning_printer())
     if outcome.result is None:
@@ -201,7 +206,7 @@ def run_one(to_fly: RunToFly, wait: bool = True, warn: Warn | None = None) -> Ou
             folder.begin(yaml_text)
             # The same sums in the same order, whatever the launcher.
             with one_thread(), remarks_to(remarks.append):
-                result = header | _fly(to_fly, yaml_text, warn)
+                result = header | _fly_and_measure(to_fly, yaml_text, warn)
             folder.finish(result)
         except (Exception, SystemExit) as error:
             # Ray, or who reads the output, ends this process: no failure of the run.
@@ -238,7 +243,9 @@ def _was_interrupted(error: BaseException | None) -> bool:
     return error is not None
 
 
-def _fly(to_fly: RunToFly, yaml_text: str, warn: Warn | None) -> dict[str, Any]:
+def _fly_and_measure(
+    to_fly: RunToFly, yaml_text: str, warn: Warn | None
+) -> dict[str, Any]:
     """Trains, flies and records; returns the metrics.
 
     Args:
@@ -304,6 +311,7 @@ class _Recordings:
             began = time.monotonic()
 
             def on_step(step: Step) -> None:
+                # A controller that learns nothing in flight says 0 of its GPs.
                 recorder.record(replace(step, gp_size=step.gp_size or gp_size))
                 if self._live:
                     # A step lasts as long as the plant's, so that a viewer can follow.

@@ -87,7 +87,7 @@ def compose(name: str, overrides: Sequence[str] = ()) -> DictConfig:
     return without_hydra(config)
 
 
-def search_options(hydra_settings: Any) -> tuple[str, ...]:
+def config_source_options(hydra_settings: Any) -> tuple[str, ...]:
     """Returns the options of a command by which its settings were found.
 
     A folder below the working folder is named from there, any other in full.
@@ -112,7 +112,7 @@ def run_command(options: Sequence[str], overrides: Sequence[str]) -> str:
     """Returns the command that flies one run.
 
     Args:
-        options: By which its settings are found, of ``search_options``.
+        options: By which its settings are found, of ``config_source_options``.
         overrides: What distinguishes it, ``key=value`` each.
     """
     return shlex.join(["gpmpc", "run", *options, *overrides])

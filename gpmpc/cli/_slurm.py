@@ -100,6 +100,7 @@ class _Array:
     chunks: Sequence[Chunk]
     timeout_min: int  # wall time of its jobs [min]
     mem_gb: float  # memory of its jobs [GB]
+    was_adopted: bool = False  # whether another call submitted it
     #: chunks whose jobs may not have ended yet
     waiting: set[int] = field(default_factory=set)
     #: looks at the queue without a job, by chunk
@@ -179,7 +180,7 @@ class Slurm:
         function(argument)
 
     def running(self, paths: Set[str]) -> Sequence[Chunk]:
-        """Returns chunks of arrays whose end nobody has seen yet."""
+        """Adopts chunks of arrays whose end nobody has seen yet."""
         self._adopted = []
         for array in self._unended():
             array.waiting = {
@@ -194,21 +195,21 @@ class Slurm:
         ]
 
     def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
-        """Submits chunks; yields how they, and the running ones, end.
+        """Submits chunks; yields how they, and the adopted ones, end.
 
-        Where Slurm refuses one array behind others, such as by a limit of jobs a user,
-        it and those behind it are left for a later call.
+        Where Slurm refuses one array after others, such as by a limit of jobs a user,
+        it and those after it are left for a later call.
 
         Raises:
             Refused: Slurm takes no such job.
         """
         most = _most_tasks()
-        parts = [chunks[i : i + most] for i in range(0, len(chunks), most)]
-        at_once = max(1, self._at_once // max(1, len(parts)))
+        chunks_by_array = [chunks[i : i + most] for i in range(0, len(chunks), most)]
+        at_once = max(1, self._at_once // max(1, len(chunks_by_array)))
         arrays = [*self._adopted]
-        for part in parts:
+        for chunks_of_array in chunks_by_array:
             try:
-                arrays.append(self._submit(work, part, at_once))
+                arrays.append(self._submit(work, chunks_of_array, at_once))
             except Refused as error:
                 if not arrays:
                     raise
@@ -259,6 +260,7 @@ class Slurm:
             chunks,
             timeout_min=content.get("timeout_min", self._timeout_min),
             mem_gb=content.get("mem_gb", self._mem_gb),
+            was_adopted=True,
             waiting={*range(len(chunks))},
         )
 
@@ -281,9 +283,11 @@ class Slurm:
             "open-mode": "append",
             "chdir": Path.cwd(),
         }
-        words = [word for key, value in options.items() for word in _option(key, value)]
+        sbatch_options = [
+            word for key, value in options.items() for word in _option(key, value)
+        ]
         try:
-            job = _sbatch(words, self._script(folder), name)
+            job = _sbatch(sbatch_options, self._script(folder), name)
         except Refused:
             if _queue() is not None:  # so that it is known that no job needs the folder
                 shutil.rmtree(folder)
@@ -396,13 +400,15 @@ class Slurm:
         log = _tail(array.folder / f"{index}.log")
         cause = _cause(job, log)
         host = job.host if job else _done_on(log or "")
-        if cause is None:
-            return ChunkEnd(array.chunks[index], host)
-        on_host = f" on {host}" if host else ""
-        reason = self._reason(cause, array, job, log)
-        number = job.number if job else f"{array.name}_{index}"
-        text = f"job {number}{on_host} {reason}"
-        return ChunkEnd(array.chunks[index], host, cause, text)
+        reason = ""
+        if cause is not None:
+            on_host = f" on {host}" if host else ""
+            number = job.number if job else f"{array.name}_{index}"
+            outcome = self._reason(cause, array, job, log)
+            reason = f"job {number}{on_host} {outcome}"
+        return ChunkEnd(
+            array.chunks[index], host, cause, reason, was_adopted=array.was_adopted
+        )
 
     def _reason(
         self, cause: Cause, array: _Array, job: _Job | None, log: str | None

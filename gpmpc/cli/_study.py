@@ -91,9 +91,9 @@ def _study(config: DictConfig, settings: dict[str, Any]) -> Study:
         composed = hydra.compose("run", words.split())
         return experiment_of(composed), plain_settings(composed, {})
 
-    parts = {"trajectory": {}} | hydra.utils.instantiate(config, _convert_="all")
+    conditions = {"trajectory": {}} | hydra.utils.instantiate(config, _convert_="all")
     module = import_module(f"gpmpc.experiments.{HydraConfig.get().job.name}")
-    return module.from_settings(parts, settings, flight)
+    return module.from_settings(conditions, settings, flight)
 
 
 def _run_trials(

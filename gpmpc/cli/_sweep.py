@@ -35,7 +35,7 @@ from gpmpc.cli._folders import folder_of, write_files
 from gpmpc.cli._launchers import Refused, launcher_of
 from gpmpc.cli._overrides import choices, combinations
 from gpmpc.cli._plain_settings import plain_settings
-from gpmpc.cli._settings import search_options
+from gpmpc.cli._settings import config_source_options
 from gpmpc.cli._terminal import print_error, progress_bar
 from gpmpc.exceptions import DataError, SettingError, check_number
 from gpmpc.studies._index import RunIndex
@@ -99,10 +99,10 @@ class Sweep:
 
     def job(self, overrides: Sequence[str]) -> Job:
         """Returns the run of these settings."""
-        words = choices(overrides)
-        folder = RunFolder(self.tree / folder_name(words))
+        own_choices = choices(overrides)
+        folder = RunFolder(self.tree / folder_name(own_choices))
         return Job(
-            choices=words,
+            choices=own_choices,
             folder=folder,
             settings=self._composer.composed(overrides),
             failed_before=folder.failed_at,
@@ -246,11 +246,11 @@ class Sweep:
         Yields:
             A function that names the bar.
         """
-        ends = _Ends(jobs)
-        with progress_bar(self.console, ends.count) as bar:
+        counter = _EndCounter(jobs)
+        with progress_bar(self.console, counter.count) as bar:
             task = bar.add_task("flying", total=total)
             yield lambda text: bar.update(task, description=text)
-            ends.look_at_all()
+            counter.look_at_all()
 
     def print_other_code(self) -> None:
         """Prints how many finished runs were flown by other code, where any was."""
@@ -287,7 +287,7 @@ class Sweep:
             print_error(f"{folder}: {warning}")
 
 
-class _Ends:
+class _EndCounter:
     """Counts the runs that have ended, with a few looks at a time.
 
     The thread that draws the bar counts, too, while this one looks at all.
@@ -315,6 +315,7 @@ class _Ends:
             self._look(len(self._jobs))
 
     def _look(self, most: int) -> None:
+        """Looks at the next ``most`` open runs, in turn."""
         added = self._jobs[self._taken :]
         self._open.extend(added)
         self._taken += len(added)
@@ -339,7 +340,7 @@ def sweep(arguments: Namespace) -> Result:
         jobs = _distinct(map(runs.job, itertools.chain([first], every_run)))
         finished_before = {job.folder.path for job in jobs if job.folder.finished}
         runs.check(jobs)
-        plan = _write_plan(runs.tree, jobs, search_options(runs.config.hydra))
+        plan = _write_plan(runs.tree, jobs, config_source_options(runs.config.hydra))
         try:
             # ``gpmpc status`` sees by the lock that the sweep is alive.
             with lock_held(plan), runs.progress(jobs, len(jobs)):
@@ -453,11 +454,11 @@ def _write_plan(tree: Path, jobs: Sequence[Job], options: Sequence[str]) -> Path
 
 def _count_warnings(warnings: Mapping[Path, str]) -> str:
     """Returns how many runs were lost or suspicious, as the end of a sentence."""
-    lost = sum(warning.startswith("lost") for warning in warnings.values())
-    suspicious = len(warnings) - lost
+    lost_flights = sum(text.startswith("lost") for text in warnings.values())
+    suspicious = len(warnings) - lost_flights
     text = ""
-    if lost:
-        text += f", {lost} lost"
+    if lost_flights:
+        text += f", {lost_flights} lost"
     if suspicious:
         text += f", {suspicious} suspicious at their end"
     return text

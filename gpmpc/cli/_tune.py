@@ -25,7 +25,7 @@ from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import write_files
 from gpmpc.cli._launchers import Refused
 from gpmpc.cli._overrides import choices, is_shared
-from gpmpc.cli._settings import run_command, search_options, without_hydra
+from gpmpc.cli._settings import config_source_options, run_command, without_hydra
 from gpmpc.cli._sweep import JobOutcome, Sweep, cannot_go_on, print_failed
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, GpmpcError, SettingError, check_number
@@ -67,15 +67,16 @@ class Tuning:
         chooses besides, such as its system, has them.
         """
         entries = {}
-        words = [*self.fixed]
+        overrides = [*self.fixed]
         for key, value in candidate.items():
             if key.rpartition(".")[2].isdecimal():
                 entries[key] = value
             else:
-                words.append(f"{key}={value}")
+                overrides.append(f"{key}={value}")
         if entries:
-            words += _overrides_of_lists(entries, self.runs.job(words).settings)
-        return words
+            settings = self.runs.job(overrides).settings
+            overrides += _overrides_of_lists(entries, settings)
+        return overrides
 
     def costs(self, candidates: Sequence[Candidate]) -> list[float]:
         """Flies candidates with every seed; returns the mean cost of each."""
@@ -139,8 +140,11 @@ def tune(arguments: Namespace) -> Result:
         failed = [each._asdict() for each in tuning.failed]
         data = {"folder": str(runs.tree), "error": reason, "failed": failed}
         return Result(data, 1)
-    words = [*choices(tuning.overrides(best)), folder_override(runs.tree / "best")]
-    command = run_command(search_options(runs.config.hydra), words)
+    best_choices = [
+        *choices(tuning.overrides(best)),
+        folder_override(runs.tree / "best"),
+    ]
+    command = run_command(config_source_options(runs.config.hydra), best_choices)
     base_cost = unchanged_cost if math.isfinite(unchanged_cost) else None
     document = search.document(base_cost, command)
     files = document.files("tuning") | {"tuning.html": document.html()}
@@ -229,13 +233,13 @@ def _overrides_of_lists(entries: Candidate, settings: ComposedSettings) -> list[
     config = settings.config()
     lists: dict[str, list] = {}
     for key, value in entries.items():
-        parent, _, last = key.rpartition(".")
+        parent, _, index = key.rpartition(".")
         before: Any = OmegaConf.select(config, parent)
-        if not OmegaConf.is_list(before) or int(last) >= len(before):
+        if not OmegaConf.is_list(before) or int(index) >= len(before):
             raise SettingError(
                 key, f"{parent} is no list with such an entry; got {before}"
             )
-        lists.setdefault(parent, list(before))[int(last)] = value
+        lists.setdefault(parent, list(before))[int(index)] = value
     return [f"{key}=[{','.join(map(str, values))}]" for key, values in lists.items()]
 
 

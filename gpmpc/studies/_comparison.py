@@ -10,6 +10,7 @@ did meanwhile is no property of either.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -113,9 +114,10 @@ def compare(report: Report, a: str, b: str) -> list[Comparison]:
         values_of_b = runs_of_b.pivot(index="others", columns="seed", values=measure)
         values_of_a, values_of_b = values_of_a.align(values_of_b)
         in_both = values_of_a.notna() & values_of_b.notna()
-        complete, left_out = _drop_gaps(in_both)
+        complete = _complete_part(in_both)
         mean_of_a = _mean_by_seed(values_of_a, complete)
         mean_of_b = _mean_by_seed(values_of_b, complete)
+        left_out = complete.left_out
         comparison = _untested(measure, len(mean_of_a), left_out)
         if len(mean_of_a) >= 2:
             comparison = _test(measure, mean_of_a, mean_of_b, left_out)
@@ -174,27 +176,35 @@ def _parse_choice(report: Report, group: str, choice: str) -> tuple[str, str]:
     return key, value
 
 
-def _drop_gaps(in_both: pd.DataFrame) -> tuple[pd.DataFrame, tuple[str, ...]]:
-    """Drops rows and columns until every run that is left is in both groups.
+class _CompletePart(NamedTuple):
+    """Settings and seeds of which both groups have all runs."""
+
+    settings: pd.Index
+    seeds: pd.Index
+    left_out: tuple[str, ...]  # names of the others
+
+
+def _complete_part(in_both: pd.DataFrame) -> _CompletePart:
+    """Leaves out settings and seeds until every run of the others is in both groups.
 
     What lacks the largest share of its runs goes first.
 
-    Returns:
-        The table that is left, and the names of what was dropped.
+    Args:
+        in_both: Whether a run is, a row a combination of settings, a column a seed.
     """
     left_out: list[str] = []
     while in_both.size and not in_both.to_numpy().all():
-        gaps_by_row = (~in_both).mean(axis=1)
+        gaps_by_setting = (~in_both).mean(axis=1)
         gaps_by_seed = (~in_both).mean(axis=0)
-        if gaps_by_seed.max() >= gaps_by_row.max():
+        if gaps_by_seed.max() >= gaps_by_setting.max():
             worst = gaps_by_seed.idxmax()
             in_both = in_both.drop(columns=worst)
         else:
-            worst = gaps_by_row.idxmax()
+            worst = gaps_by_setting.idxmax()
             in_both = in_both.drop(index=worst)
         left_out.append(str(worst))
     left_out.sort(key=_settings_before_seeds)
-    return in_both, tuple(left_out)
+    return _CompletePart(in_both.index, in_both.columns, tuple(left_out))
 
 
 def _settings_before_seeds(name: str) -> tuple[bool, tuple[int, float, str]]:
@@ -202,9 +212,9 @@ def _settings_before_seeds(name: str) -> tuple[bool, tuple[int, float, str]]:
     return is_seed, in_order(name.removeprefix(f"{SEED}="))
 
 
-def _mean_by_seed(values: pd.DataFrame, complete: pd.DataFrame) -> np.ndarray:
+def _mean_by_seed(values: pd.DataFrame, complete: _CompletePart) -> np.ndarray:
     """Returns the mean over the other settings, of every seed that is complete."""
-    return values.loc[complete.index, complete.columns].mean(axis=0).to_numpy()
+    return values.loc[complete.settings, complete.seeds].mean(axis=0).to_numpy()
 
 
 def _test(
@@ -297,21 +307,21 @@ def _sentence(label: str, comparison: Comparison) -> str:
     """Returns verdict, medians, differences and tests of one measure."""
     c = comparison
     low, median, high = c.quartiles
-    parts = [f"{label}: {c.verdict}"]
+    clauses = [f"{label}: {c.verdict}"]
     if c.pairs >= 2:
-        parts = [
+        clauses = [
             f"{label}: {c.verdict}. Medians {c.medians[0]:.4g} and {c.medians[1]:.4g}",
             f"differences {median:.3g} [{low:.3g}, {high:.3g}]",
         ]
     if c.pairs >= 2 and c.interval[0] != c.interval[1]:
-        parts += [
+        clauses += [
             f"Wilcoxon signed-rank p = {c.wilcoxon:.3g}, "
             f"rank-biserial {c.rank_biserial:.2f}",
             f"mean difference {c.difference:.3g} "
             f"(95 %: {c.interval[0]:.3g} to {c.interval[1]:.3g}), "
             f"paired t-test p = {c.t_test:.3g}, d_z {c.standardised:.2f}",
         ]
-    parts.append(f"n = {c.pairs}")
+    clauses.append(f"n = {c.pairs}")
     if any(c.lost):
-        parts.append(f"lost, without a number: {c.lost[0]} of A, {c.lost[1]} of B")
-    return "; ".join(parts)
+        clauses.append(f"lost, without a number: {c.lost[0]} of A, {c.lost[1]} of B")
+    return "; ".join(clauses)

@@ -162,18 +162,19 @@ class Experiment:
         nothing = np.zeros(len(self.system.state_names))
         settings = getattr(self.controller, "keywords", {}).get("prediction")
         plans_means_alone = getattr(settings, "covariance", "") == "none"
-        plans_noise = getattr(self.propagator, "process_noise", False)
-        if plans_noise and not plans_means_alone:
-            return nothing
-        if self.loop == "model":
+        propagates_noise = getattr(self.propagator, "process_noise", False)
+        is_planned = propagates_noise and not plans_means_alone
+        is_noiseless = self.loop == "model"  # rolled on itself, by its means
+        if is_planned or is_noiseless:
             return nothing
         model = self.model if training is None else training.posterior
         if model is not None and self.learns:
-            variances = model.noise_covariance.diagonal()[: len(nothing)]
-            return variances.sqrt().numpy()
-        if self.noise is None or self.noise.process is None:
+            learned_variances = model.noise_covariance.diagonal()[: len(nothing)]
+            return learned_variances.sqrt().numpy()
+        noise_of_plant = None if self.noise is None else self.noise.process
+        if noise_of_plant is None:
             return nothing
-        return np.array(self.noise.process, dtype=float)
+        return np.array(noise_of_plant, dtype=float)
 
     @property
     def _dimensions(self) -> tuple[int, int]:

@@ -137,7 +137,8 @@ def _fly(
 ) -> Flown:
     """Flies with a model, or on the plant's own where the controller learns none."""
     plant = experiment.plant_in_loop
-    planner = experiment.controller(model if experiment.learns else plant)
+    make_planner = experiment.controller
+    planner = make_planner(model if experiment.learns else plant)
     controller = planner
     if isinstance(experiment.learning, OnlineLearning):
         controller = LearningController(planner, experiment.learning)

@@ -41,7 +41,7 @@ def metrics(experiment: Experiment, flown: Flown) -> dict[str, Any]:
         "judgement": _judgement(flown),
         "lost": _loss(experiment, flown),
         "outlook": asdict(flown.outlook) | {"warnings": [*flown.outlook.warnings]},
-        "violations": _violations(flown),
+        "violations": _violations(experiment, flown),
         "failures": _failures(rollout),
         "far_from_data": len(rollout.far_from_data),
         "suboptimal": _suboptimal(rollout),
@@ -187,12 +187,29 @@ def _on_one_line(error: Exception) -> str:
     return " ".join(str(error).split())
 
 
-def _violations(flown: Flown) -> dict[str, dict[str, Any]]:
-    """Returns how often each kind of constraint was broken, by name, as plain data."""
+def _violations(experiment: Experiment, flown: Flown) -> dict[str, dict[str, Any]]:
+    """Returns how often each kind of constraint was broken, by name, as plain data.
+
+    Of bounds it says by how much at most, for each entry that broke its own, with the
+    unit; entries of other constraints have neither name nor unit.
+    """
+    system = experiment.system
     rates = _violation_rates(
         flown.controller.problem, flown.controller.horizon, flown.rollout
     )
-    return {name: asdict(rate) | {"rate": rate.rate} for name, rate in rates.items()}
+    names_by_kind = {"inputs": system.input_names, "states": system.state_names}
+    content = {}
+    for kind, rate in rates.items():
+        names = names_by_kind.get(kind, ())
+        labels = [f"{name} [{system.units[name]}]" for name in names]
+        worst = zip(labels, rate.worst_by_entry, strict=False)
+        content[kind] = asdict(rate) | {
+            "worst_by_entry": {
+                label: distance for label, distance in worst if distance
+            },
+            "rate": rate.rate,
+        }
+    return content
 
 
 def _violation_rates(

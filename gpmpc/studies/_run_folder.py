@@ -67,8 +67,9 @@ class RunState(Enum):
     RUNNING = "running"
     FINISHED = "finished"
     FAILED = "failed"
-    #: begun, and neither ended nor in anybody's hands: its process was killed
-    LOST = "lost"
+    #: begun, and neither ended nor in anybody's hands: its process was killed. (A
+    #: flight that is "lost" is something else: it was flown to its end, and judged.)
+    ABANDONED = "lost"
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ class RunFolder:
         if (self.path / ERROR).exists():
             return RunState.FAILED
         if (self.path / CONFIG).exists():
-            return RunState.LOST
+            return RunState.ABANDONED
         return RunState.NOT_BEGUN
 
     @property
@@ -216,7 +217,7 @@ class RunFolder:
         }
         write_whole(self.path / ERROR, json.dumps(content, indent=1) + "\n")
 
-    def lose(
+    def end_from_outside(
         self, reason: str, kind: str, about: Mapping[str, Any], is_attempt: bool = True
     ) -> None:
         """Keeps why an attempt ended that could not say so itself.
@@ -225,10 +226,10 @@ class RunFolder:
             reason: In a line.
             kind: Such as "time" or "memory".
             about: What else is kept, such as the choices.
-            is_attempt: Whether it counts among ``lost_attempts``.
+            is_attempt: Whether it counts among ``outside_attempts``.
 
         Raises:
-            Busy: A process works on the run, so that it is not lost.
+            Busy: A process works on the run, so that it goes on.
         """
         with self.locked(wait=False):
             if self.finished:
@@ -237,14 +238,14 @@ class RunFolder:
                 **about,
                 "error": " ".join(reason.split()),
                 "kind": kind,
-                "attempts": self.lost_attempts + is_attempt,
+                "attempts": self.outside_attempts + is_attempt,
                 "traceback": "",
             }
             write_whole(self.path / ERROR, json.dumps(content, indent=1) + "\n")
 
     @property
-    def lost_attempts(self) -> int:
-        """Number of attempts that could not say themselves why they ended."""
+    def outside_attempts(self) -> int:
+        """Number of attempts that were ended from outside, and could not say why."""
         for name in (ERROR, _EARLIER_ERROR):
             try:
                 content = json.loads((self.path / name).read_text(encoding="utf-8"))
@@ -394,14 +395,14 @@ def describe_code(about: Mapping[str, Any]) -> str:
     """
     version = _mapping(about.get("versions")).get("gpmpc")
     git = _mapping(about.get("git"))
-    words = ["a gpmpc that did not say which"]
+    facts = ["a gpmpc that did not say which"]
     if version:
-        words = [f"gpmpc {version}"]
+        facts = [f"gpmpc {version}"]
     if git.get("commit"):
-        words.append(f"commit {str(git['commit'])[:10]}")
+        facts.append(f"commit {str(git['commit'])[:10]}")
     if git.get("dirty"):
-        words.append("changed")
-    return ", ".join(words)
+        facts.append("changed")
+    return ", ".join(facts)
 
 
 def _mapping(value: Any) -> Mapping[str, Any]:

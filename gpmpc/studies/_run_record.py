@@ -186,7 +186,7 @@ def read_record(path: Path, content: Result) -> RunRecord:
     for name, value in measures.items():
         if value is not None and not _is_finite_number(value):
             raise ValueError(f"{name}: must be a finite number; got {value!r:.80}")
-    lost = _loss(content)
+    loss = _loss(content)
     return RunRecord(
         choices=choices,
         state="finished",
@@ -195,8 +195,8 @@ def read_record(path: Path, content: Result) -> RunRecord:
         settings=Settings(flattened(settings), {}),
         origin=origin,
         code=code,
-        lost=lost,
-        suspicious="" if lost else _suspicion(content),
+        lost=loss,
+        suspicious="" if loss else _suspicion(content),
         warning=warning_of(content) or "",
         made_by=_made_by(content),
         search_options=_search_options(content),
@@ -210,10 +210,10 @@ def _is_finite_number(value: Any) -> bool:
 
 def _loss(content: Result) -> str:
     """Returns since when and why a run was lost; empty where it was not."""
-    lost = content.get("lost") or ""
-    if isinstance(lost, Mapping):
-        lost = ", ".join(f"{key} {value}" for key, value in lost.items())
-    return plain_text(str(lost))
+    loss = content.get("lost") or ""
+    if isinstance(loss, Mapping):
+        loss = ", ".join(f"{key} {value}" for key, value in loss.items())
+    return plain_text(str(loss))
 
 
 def _suspicion(content: Result) -> str:
@@ -275,10 +275,10 @@ def parsed(choices: Any) -> Choices:
 
 def warning_of(result: Result) -> str | None:
     """Returns in a line that a flight was lost, or suspicious at its end, and why."""
-    lost = result.get("lost")
+    loss = result.get("lost")
     judgement = result.get("judgement")
-    if lost:
-        return plain_text(f"lost: {_since(lost)}")
+    if loss:
+        return plain_text(f"lost: {_since(loss)}")
     if isinstance(judgement, Mapping) and judgement.get("level") == "suspicious":
         return plain_text(f"suspicious: {_since(judgement)}")
     return None
@@ -300,8 +300,8 @@ def _search_options(content: Result) -> str:
     provenance = content.get("provenance") or {}
     options = []
     with suppress(ValueError):  # an older command, whose quotes were not kept
-        words = shlex.split(provenance.get("command") or "")
-        for word, next_word in pairwise([*words, ""]):
+        command = shlex.split(provenance.get("command") or "")
+        for word, next_word in pairwise([*command, ""]):
             option, equals, value = word.partition("=")
             if option in _SEARCH_OPTIONS:
                 options += [option, value if equals else next_word]

@@ -74,8 +74,8 @@ class Report:
     runs: pd.DataFrame
     #: what could not be read of it, with the reason, one line each
     skipped: tuple[str, ...] = ()
-    #: finished runs that others with the same choices and seed stand for, a line for
-    #: each pair of folders
+    #: runs that others with the same choices and seed stand for, a line for each pair
+    #: of folders and what became of them
     repeated: tuple[str, ...] = ()
 
     @cached_property
@@ -121,9 +121,8 @@ class Report:
 
         Each run flies into the folder that it is in, or was asked for in. There are
         more of a cell whose runs are of several, whose settings were found in several
-        ways, or where
-        some runs name their seed and some have the usual one. Skipped runs are not
-        among them: a run is not flown over what lies in its folder.
+        ways, or where some runs name their seed and some have the usual one. Skipped
+        runs are not among them: a run is not flown over what lies in its folder.
         """
         to_fly = self.runs[self.runs.state.isin(("missing", "failed"))]
         commands = []
@@ -135,7 +134,7 @@ class Report:
                 for key, value in (self.constants | varied).items()
                 if value != _DEFAULT
             }
-            words = [
+            command = [
                 "gpmpc",
                 "run",
                 "-m",
@@ -143,9 +142,9 @@ class Report:
                 *overrides_of(choices),
             ]
             if names_seed:
-                words.append(f"{SEED}={','.join(runs.seed)}")
-            words.append(folder_override(sweep))
-            commands.append(plain_text(shlex.join(words)))
+                command.append(f"{SEED}={','.join(runs.seed)}")
+            command.append(folder_override(sweep))
+            commands.append(plain_text(shlex.join(command)))
         return commands
 
 
@@ -173,7 +172,7 @@ class _Files:
     runs: list[RunRecord] = field(default_factory=list)
     planned: list[RunRecord] = field(default_factory=list)  # as if all were missing
     skipped: list[str] = field(default_factory=list)  # with the reason, a line each
-    unread_folders: set[str] = field(default_factory=set)  # names
+    unread_folders: set[Path] = field(default_factory=set)
 
 
 def _read_files(tree: Path) -> _Files:
@@ -192,7 +191,7 @@ def _read_files(tree: Path) -> _Files:
             files.runs.append(indices[runs].record(path))
         except READ_ERRORS as error:
             files.skipped.append(_why_skipped(path, "run", error))
-            files.unread_folders.add(path.parent.name)
+            files.unread_folders.add(path.parent)
     for index in indices.values():
         index.write()
     for path in paths.plans:
@@ -200,7 +199,7 @@ def _read_files(tree: Path) -> _Files:
             files.planned += _planned_runs(_read_json(path), path.parent)
         except READ_ERRORS as error:
             files.skipped.append(_why_skipped(path, "sweep", error))
-            files.unread_folders.add(path.parent.name)
+            files.unread_folders.add(path.parent)
     return files
 
 
@@ -255,14 +254,18 @@ def _why_skipped(path: Path, writer: str, error: Exception) -> str:
 
 
 def _not_there(files: _Files) -> list[RunRecord]:
-    """Returns the runs that were planned and are missing or cannot be read."""
-    names = {_name_of(run.choices) for run in files.runs}
+    """Returns the runs that were planned and are missing or cannot be read.
+
+    A run of another folder with the same choices is another run.
+    """
+    present = {(run.sweep, _name_of(run.choices)) for run in files.runs}
     absent = []
     for run in files.planned:
         name = _name_of(run.choices)
-        if name in files.unread_folders:
+        assert run.sweep is not None
+        if run.sweep / name in files.unread_folders:
             run = replace(run, state="skipped")
-        if name not in names:
+        if (run.sweep, name) not in present:
             absent.append(run)
     return absent
 
@@ -275,7 +278,12 @@ def _name_of(choices: Choices) -> str:
 def _put_together(
     tree: Path, runs: Sequence[RunRecord], skipped: Sequence[str]
 ) -> Report:
-    """Finds what was varied, and sorts the runs by cell and seed."""
+    """Finds what was varied, and sorts the runs by cell and seed.
+
+    Of the runs ``controller=lqr seed=3`` and ``seed=3``, the second one with the
+    settings' own controller, convex: ``controller`` is the variable, ("convex",) and
+    ("lqr",) are the cells, and the place of each run is seed "3" of its cell.
+    """
     all_choices = _completed_choices(runs)
     values = _values_by_setting(all_choices)
     variables = tuple(sorted(key for key in values if len(values[key]) > 1))
@@ -306,20 +314,24 @@ def _put_together(
 def _repeated(
     runs: Iterable[RunRecord], runs_of_report: Iterable[RunRecord]
 ) -> Iterator[str]:
-    """Yields how many finished runs of a folder are left out, and what is shown.
+    """Yields how many runs of a folder are left out, and what is shown for them.
+
+    Those that cannot be read are named elsewhere.
 
     Args:
-        runs: All that were read.
+        runs: All that were read or planned.
         runs_of_report: Of each of them the run that the report has at its place.
     """
-    counts: Counter[tuple[Path, Path]] = Counter()
+    counts: Counter[tuple[str, Path, Path]] = Counter()
     for run, shown in zip(runs, runs_of_report, strict=True):
-        if run is shown or run.state != "finished":
+        # Two sweeps of one folder may have planned the same missing run.
+        is_same_gap = run.state != "finished" and run.sweep == shown.sweep
+        if run is shown or run.state == "skipped" or is_same_gap:
             continue
-        assert run.folder is not None
-        assert shown.folder is not None
-        counts[run.folder.parent, shown.folder.parent] += 1
-    for (folder, shown_folder), count in counts.items():
+        assert run.sweep is not None
+        assert shown.sweep is not None
+        counts[run.state, run.sweep, shown.sweep] += 1
+    for (state, folder, shown_folder), count in counts.items():
         others = "others there"
         advice = ""
         if folder != shown_folder:
@@ -327,7 +339,7 @@ def _repeated(
         if not shown_folder.is_relative_to(folder):
             advice = f"; gpmpc report {folder} shows them"
         yield plain_text(
-            f"{count} finished in {folder}: {others} have the same choices and seeds, "
+            f"{count} {state} in {folder}: {others} have the same choices and seeds, "
             f"and are shown{advice}"
         )
 

@@ -82,10 +82,10 @@ def _nominal(result: Result) -> str:
 
 
 def _loss(result: Result) -> str:
-    lost = result.get("lost")
-    if not lost:
+    loss = result.get("lost")
+    if not loss:
         return ""
-    return f"from step {lost['step']} ({lost['time']:g} s) on: {lost['reason']}"
+    return f"from step {loss['step']} ({loss['time']:g} s) on: {loss['reason']}"
 
 
 def _judgement(result: Result) -> str:
@@ -147,9 +147,13 @@ def _violations(rate: Mapping[str, Any]) -> str:
     count = f"{rate['violations']} of {rate['steps']} steps outside"
     interval = f"(95 %: {100 * rate['low']:.2g} to {100 * rate['high']:.2g} %)"
     text = f"{count} {interval}"
-    if rate["violations"]:
-        text += f", by up to {rate['worst']:.3g}"
-    return text
+    if not rate["violations"]:
+        return text
+    worst_by_entry = rate.get("worst_by_entry")
+    if not worst_by_entry:  # of constraints without units, and of older results
+        return f"{text}, by up to {rate['worst']:.3g}"
+    distances = [f"{worst:.3g} in {name}" for name, worst in worst_by_entry.items()]
+    return f"{text}, by up to {', '.join(distances)}"
 
 
 def _suboptimal(result: Result) -> str:

@@ -70,19 +70,19 @@ class SweepStatus:
 
     def line(self, with_reasons: bool = True) -> str:
         """Returns all of it in one line, or all but why runs failed."""
-        words = {
+        names = {
             RunState.FINISHED: "finished",
             RunState.FAILED: "failed",
             RunState.RUNNING: "running",
-            RunState.LOST: "begun and left",
+            RunState.ABANDONED: "begun and left",
             RunState.NOT_BEGUN: "to fly",
         }
-        parts = [
-            f"{self.counts[state]} {word}"
-            for state, word in words.items()
+        counts = [
+            f"{self.counts[state]} {name}"
+            for state, name in names.items()
             if self.counts[state] or state in (RunState.FINISHED, RunState.FAILED)
         ]
-        text = f"{self.total} runs: {', '.join(parts)}"
+        text = f"{self.total} runs: {', '.join(counts)}"
         if self.left:
             text += f"; {self.speed()}"
         if not with_reasons:
@@ -101,12 +101,12 @@ class SweepStatus:
             return "no run has ended yet"
         seconds = round(self.seconds_left or 0)
         hours, minutes = divmod(seconds // 60, 60)
-        left = f"{hours}:{minutes:02}:{seconds % 60:02} left"
+        time_left = f"{hours}:{minutes:02}:{seconds % 60:02} left"
         if self.rate >= 1:
-            return f"{self.rate:.3g} a second, {left}"
+            return f"{self.rate:.3g} a second, {time_left}"
         if self.rate >= 1 / 60:
-            return f"{60 * self.rate:.3g} a minute, {left}"
-        return f"{3600 * self.rate:.3g} an hour, {left}"
+            return f"{60 * self.rate:.3g} a minute, {time_left}"
+        return f"{3600 * self.rate:.3g} an hour, {time_left}"
 
 
 @dataclass

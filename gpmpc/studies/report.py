@@ -134,12 +134,12 @@ def _mixed_code(report: Report) -> list[str]:
         dates[run.code] = max(dates.get(run.code, ""), run.origin.get("date", ""))
     if len(counts) < 2:
         return []
-    parts = [
+    counts_by_code = [
         f"{counts[code]} of {commits[code]} (last {dates[code][:10] or MISSING})"
         for code in sorted(counts, key=lambda code: dates[code])
     ]
     line = "the finished runs are of different code, and may differ for that alone: "
-    return [line + "; ".join(parts)]
+    return [line + "; ".join(counts_by_code)]
 
 
 def _lead(report: Report) -> str:
@@ -173,10 +173,10 @@ def _origins(report: Report, key: str) -> list[str]:
 def _links(report: Report, folder: Path) -> dict[str, str]:
     """Returns the runs as seen from ``folder``, by their name in the tree."""
     parents = {run.folder.parent for run in report.ended}
-    seen = {each: os.path.relpath(each.resolve(), folder) for each in parents}
+    relative = {each: os.path.relpath(each.resolve(), folder) for each in parents}
     return {
         plain_text(str(run.folder.relative_to(report.tree))): os.path.join(
-            seen[run.folder.parent], run.folder.name
+            relative[run.folder.parent], run.folder.name
         )
         for run in report.ended
     }
@@ -192,9 +192,9 @@ def _states(report: Report) -> pd.DataFrame:
     counts = pd.crosstab(runs.cell, runs.state).reindex(
         columns=["finished", "failed", "missing", "skipped"], fill_value=0
     )
-    lost = (runs.lost != "").groupby(runs.cell).sum()
+    lost_runs = (runs.lost != "").groupby(runs.cell).sum()
     suspicious = (runs.suspicious != "").groupby(runs.cell).sum()
-    counts.insert(1, "lost", lost)
+    counts.insert(1, "lost", lost_runs)
     counts.insert(2, "suspicious", suspicious)
     return counts
 

@@ -56,7 +56,7 @@ def fly_one(job):
     job.folder.begin("act: 1\n")
     if act == "dies":
         os.kill(os.getpid(), signal.SIGKILL)
-    if act == "dies once" and job.folder.lost_attempts == 0:
+    if act == "dies once" and job.folder.outside_attempts == 0:
         os.kill(os.getpid(), signal.SIGSEGV)
     if act == "sleeps":
         time.sleep(600)

@@ -17,7 +17,7 @@ from gpmpc.cli._composing import Composer
 from gpmpc.cli._examples import Examples
 from gpmpc.cli._overrides import choices, combinations
 from gpmpc.cli._settings import model_file, settings_folders
-from gpmpc.cli._sweep import JobOutcome, Sweep, _end_of, _Ends
+from gpmpc.cli._sweep import JobOutcome, Sweep, _end_of, _EndCounter
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.studies._index import RunIndex
 from gpmpc.studies._run_folder import Busy, RunFolder, RunState, folder_name
@@ -118,7 +118,7 @@ def test_a_chunk_goes_on_behind_what_cannot_be_flown(tmp_path, monkeypatch):
     states = [job.folder.state for job in jobs]
     assert states == [RunState.NOT_BEGUN] * 2 + [RunState.FAILED] * 2 + states[:1]
     assert jobs[2].folder.error() == "model.path: cannot read m"
-    assert jobs[2].folder.lost_attempts == 0
+    assert jobs[2].folder.outside_attempts == 0
     flown.clear()
     fly_chunk(Chunk(tuple(jobs[2:]), most_work=0.0))
     assert flown == [2]  # it always flies one
@@ -143,7 +143,7 @@ def test_a_flight_that_ends_its_process_has_failed(tmp_path, monkeypatch):
             raise SystemExit(2)
         return {}
 
-    monkeypatch.setattr(_run, "_fly", flight)
+    monkeypatch.setattr(_run, "_fly_and_measure", flight)
     fly_chunk(Chunk(tuple(jobs), None))
     assert [job.folder.state for job in jobs] == [RunState.FAILED, RunState.FINISHED]
     assert jobs[0].folder.error() == "2"
@@ -165,11 +165,11 @@ def test_remarks_stay_with_a_run_whatever_becomes_of_its_chunk(
             raise Death
         return {}
 
-    monkeypatch.setattr(_run, "_fly", flight)
+    monkeypatch.setattr(_run, "_fly_and_measure", flight)
     with pytest.raises(Death):
         fly_chunk(Chunk(tuple(jobs), None))
     states = [job.folder.state for job in jobs]
-    assert states == [RunState.FINISHED, RunState.FAILED, RunState.LOST]
+    assert states == [RunState.FINISHED, RunState.FAILED, RunState.ABANDONED]
     remarks = [job.folder.remarks() for job in jobs]
     assert remarks == [["few rows of 0"], ["few rows of 1"], []]
     assert capfd.readouterr() == ("", "")
@@ -203,7 +203,7 @@ def test_a_sweep_remembers_only_the_settings_that_a_run_has(
         model.write_bytes(content)
         return metrics_of(0.1)
 
-    monkeypatch.setattr(_run, "_fly", flight)
+    monkeypatch.setattr(_run, "_fly_and_measure", flight)
     compared = []
     resolve = _sweep.plain_settings
     monkeypatch.setattr(
@@ -233,7 +233,9 @@ def test_the_bar_may_look_while_all_are_looked_at():
         def done(self):
             return bar_looks()
 
-    ends = _Ends([First(), SimpleNamespace(done=True), SimpleNamespace(done=True)])
+    ends = _EndCounter(
+        [First(), SimpleNamespace(done=True), SimpleNamespace(done=True)]
+    )
     ends.look_at_all()
     assert ends.count() == 3
 

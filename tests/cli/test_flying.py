@@ -279,4 +279,7 @@ def test_a_killed_parent_leaves_no_process_and_lost_runs(tmp_path):
         time.sleep(0.05)
     parent.send_signal(signal.SIGKILL)
     parent.communicate()  # ends when the last process that holds the pipe has ended
-    assert [folder.state for folder in folders] == [RunState.LOST, RunState.LOST]
+    assert [folder.state for folder in folders] == [
+        RunState.ABANDONED,
+        RunState.ABANDONED,
+    ]

@@ -47,7 +47,7 @@ def test_a_live_flight_again_is_finished_when_it_has_ended(tmp_path, monkeypatch
             raise ArithmeticError("it ended early")
         return {"flight": len(during)}
 
-    monkeypatch.setattr(_run, "_fly", flight)
+    monkeypatch.setattr(_run, "_fly_and_measure", flight)
     once = to_fly(tmp_path)
     live = to_fly(tmp_path, "live=true")
     assert run_one(once).result["flight"] == 1
@@ -59,7 +59,7 @@ def test_a_live_flight_again_is_finished_when_it_has_ended(tmp_path, monkeypatch
     assert folder.state is RunState.FINISHED
     with pytest.raises(KeyboardInterrupt):
         run_one(live)
-    assert folder.state is RunState.LOST
+    assert folder.state is RunState.ABANDONED
     assert "it ended early" in run_one(live).error
     assert folder.state is RunState.FAILED
     assert during == [RunState.RUNNING] * 4
@@ -69,7 +69,7 @@ def test_a_run_that_another_process_flies_is_waited_for_and_told(
     tmp_path, monkeypatch, capsys
 ):
     run = to_fly(tmp_path)
-    monkeypatch.setattr(_run, "_fly", lambda *_: {"times": {"run": 7.5}})
+    monkeypatch.setattr(_run, "_fly_and_measure", lambda *_: {"times": {"run": 7.5}})
     monkeypatch.setattr(_run_folder, "is_locked", lambda _: True)
     run_one(run)
     assert "gpmpc: waiting for " in capsys.readouterr().err
@@ -84,11 +84,11 @@ def test_a_reader_that_has_seen_enough_makes_no_failed_run(tmp_path, monkeypatch
     def fly(*_):
         raise OutputEnded(1)
 
-    monkeypatch.setattr(_run, "_fly", fly)
+    monkeypatch.setattr(_run, "_fly_and_measure", fly)
     run = to_fly(tmp_path)
     with pytest.raises(OutputEnded):
         run_one(run)
-    assert run.folder.state is RunState.LOST
+    assert run.folder.state is RunState.ABANDONED
 
 
 def test_a_model_that_cannot_be_read_is_no_fault_of_the_folder(tmp_path):

@@ -385,6 +385,7 @@ def test_settings_and_classes_of_the_users_own_folder_are_found(sweep, tmp_path)
     options = "--config-name ours --config-dir own"
     command = result["provenance"]["command"]
     assert command.startswith(f"gpmpc run {options} controller=mine ")
+    assert command.endswith(" folder=tree")
     for plan in (tmp_path / "tree").glob("sweep-*.json"):
         assert json.loads(plan.read_text())["search_options"] == options
 

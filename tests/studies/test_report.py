@@ -90,7 +90,9 @@ def lose(tree, choices, command="gpmpc run"):
         "settings": {},
         "provenance": {"command": command},
     }
-    RunFolder(folder_of(tree, choices)).lose("its process died", "crash", about)
+    RunFolder(folder_of(tree, choices)).end_from_outside(
+        "its process died", "crash", about
+    )
 
 
 def test_gaps_of_runs_without_a_seed_are_filled_without_one(tmp_path):
@@ -113,6 +115,20 @@ def test_gaps_are_filled_in_the_sweep_that_has_them(tmp_path):
         f"gpmpc run -m controller=lqr horizon={horizon} folder={tmp_path / name}"
         for horizon, name in ((5, "first"), (6, "second"), (9, "third"))
     ]
+
+
+def test_a_gap_that_a_run_of_another_sweep_stands_for_is_told(tmp_path):
+    first = tmp_path / "first"
+    second = tmp_path / "second"
+    add(first, "lqr", 0, 0.1)
+    plan(first, [chosen("lqr", 0)[0], chosen("lqr", 1)[0]])
+    plan(second, [chosen("lqr", 0)[0], chosen("lqr", 1)[0]])
+    report = read_report(tmp_path)
+    assert seeds(cells(report)[0], "missing") == ["1"]
+    assert report.repeated == (
+        f"2 missing in {second}: runs of {first} have the same choices and seeds, and "
+        f"are shown; gpmpc report {second} shows them",
+    )
 
 
 def test_a_failed_run_that_chose_no_seed_flies_again_in_its_folder(tmp_path):

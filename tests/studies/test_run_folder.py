@@ -175,8 +175,8 @@ def test_a_folder_alone_tells_how_far_its_run_is(tmp_path):
         assert folder.state is RunState.RUNNING
         assert folder.last_worker == f"process {os.getpid()} on {socket.gethostname()}"
         with pytest.raises(Busy):
-            folder.lose("the node failed", "node", {})
-    assert folder.state is RunState.LOST  # left as by a process that was killed
+            folder.end_from_outside("the node failed", "node", {})
+    assert folder.state is RunState.ABANDONED  # left as by a process that was killed
     assert folder.begun_at == (folder.path / "config.yaml").stat().st_mtime_ns
     with folder.locked():
         folder.fail(ValueError("no"), {})
@@ -186,7 +186,7 @@ def test_a_folder_alone_tells_how_far_its_run_is(tmp_path):
         assert folder.state is RunState.RUNNING
         folder.finish({"settings": {}})
     assert folder.state is RunState.FINISHED
-    folder.lose("too late", "time", {})
+    folder.end_from_outside("too late", "time", {})
     assert folder.state is RunState.FINISHED
     assert not (folder.path / ERROR).exists()
 
@@ -204,27 +204,27 @@ def test_who_may_only_read_a_run_sees_whether_it_flies(tmp_path, monkeypatch):
         folder.begin("steps: 1\n")
         monkeypatch.setattr(os, "open", read_only)
         assert folder.state is RunState.RUNNING
-    assert folder.state is RunState.LOST
+    assert folder.state is RunState.ABANDONED
 
 
 def test_attempts_that_were_ended_from_outside_are_counted(tmp_path):
     folder = RunFolder(tmp_path / "run")
     for count in (1, 2):
-        folder.lose("over its memory", "memory", {"choices": ["a=1"]})
+        folder.end_from_outside("over its memory", "memory", {"choices": ["a=1"]})
         content = json.loads((folder.path / ERROR).read_text())
         assert content["choices"] == ["a=1"]
         assert (content["error"], content["kind"]) == ("over its memory", "memory")
-        assert content["attempts"] == folder.lost_attempts == count
+        assert content["attempts"] == folder.outside_attempts == count
         with folder.locked():
             folder.begin("steps: 1\n")
-        assert folder.lost_attempts == count
+        assert folder.outside_attempts == count
     with folder.locked():
         folder.fail(ValueError("of its own"), {})
-    assert folder.lost_attempts == 0
+    assert folder.outside_attempts == 0
     with folder.locked():
         folder.begin("steps: 1\n")
         folder.finish({"settings": {}})
-    assert folder.lost_attempts == 0
+    assert folder.outside_attempts == 0
 
 
 def test_settings_that_are_no_number_do_not_differ_from_themselves():

@@ -126,7 +126,15 @@ def test_states_are_counted_outside_the_tightest_current_boxes(error, outside):
     narrow = np.full((2, 6), 9.0)
     narrow[:, 0] = 0.05, 0.01  # of the first stage, and of one later on
     boxes = Box(np.full(6, -1.0), np.full(6, 1.0)), Box(np.full((2, 6), -9.0), narrow)
-    violations = metrics_of(error, constraints=boxes)["violations"]
+    result = metrics_of(error, constraints=boxes)
+    violations = result["violations"]
+    beyond = max(error - 0.05, -1.0 - error)
+    label = "x [m]" if beyond > 0 else None
+    assert violations["states"]["worst_by_entry"] == (
+        {label: pytest.approx(beyond)} if label else {}
+    )
+    by_how_much = f", by up to {beyond:.3g} in {label}" if label else " %)"
+    assert said(result)["bounds of states"].endswith(by_how_much)
     assert (violations["states"]["violations"], violations["states"]["steps"]) == (
         outside,
         20,

@@ -49,7 +49,7 @@ def test_runs_are_counted_by_their_state(tree):
         RunState.FINISHED: 4,
         RunState.FAILED: 3,
         RunState.RUNNING: 1,
-        RunState.LOST: 1,
+        RunState.ABANDONED: 1,
         RunState.NOT_BEGUN: 3,
     }
     assert status.total == 12
