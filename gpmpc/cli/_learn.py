@@ -69,20 +69,21 @@ def learn(arguments: argparse.Namespace) -> Result:
             arguments, split, folder=folder, console=console
         )
         held_out = split.held_out(learned.model.past)
-        logs.save_learned(learned, folder / _MODEL)
+        reasons = _reasons_against(learned, judgement)
+        learned = replace(learned, reasons=reasons)
         report = _make_report(learned, judgement, train, held_out)
         card = _make_card(learned, judgement, train, held_out)
         files = report.files("report")
         files["report.html"] = report.html()
         files["card.md"] = card.markdown()
+        _save_model(learned, folder)
         write_files(folder, files, "to")
     Console().print(terminal(report.tables[:1]))
-    if judgement.steps_not_told:
+    if judgement.steps_not_told and not _is_untold(judgement):
         console.print(_not_told(judgement))
     for line in judgement.losses:
         console.print(f"loses: {line}")
     console.print(f"written to {folder}: {_MODEL}, report.html, report.md, card.md")
-    reasons = _reasons_against(learned, judgement)
     for reason in reasons:
         print_error(f"do not use this model: {reason}")
     for line in _advice(learned):
@@ -101,12 +102,28 @@ def _reasons_against(learned: IdentifiedModel, judgement: Judgement) -> tuple[st
     """Returns why a model should not be used; nothing where it may be.
 
     A model for a controller is not asked to beat the ridge regression, with which none
-    can plan, but to know what the inputs do.
+    can plan, but to know what the inputs do. A model of which nobody knows whether it
+    loses to what costs nothing should not be used either.
     """
+    untold = ()
+    if _is_untold(judgement):
+        untold = (f"{_not_told(judgement)}: hold out longer runs",)
     if learned.control is None:
-        return judgement.losses
+        return (*judgement.losses, *untold)
     losses = judgement.losses_to(logs.PLANNABLE_BASELINES)
-    return (*learned.control.faults, *losses)
+    return (*learned.control.faults, *losses, *untold)
+
+
+def _is_untold(judgement: Judgement) -> bool:
+    """Tells whether held-out rows are too few to tell a loss at any step ahead."""
+    return judgement.steps_not_told == judgement.steps
+
+
+def _save_model(learned: IdentifiedModel, folder: Path) -> None:
+    """Saves a model, after the report and the card of an earlier one are gone."""
+    for path in (*folder.glob("report.*"), folder / "card.md"):
+        path.unlink(missing_ok=True)
+    logs.save_learned(learned, folder / _MODEL)
 
 
 def _advice(learned: IdentifiedModel) -> tuple[str, ...]:
@@ -150,7 +167,7 @@ def _learn_and_judge(
         try:
             check_learned(learned, held_out, train)
         except DataError as error:
-            logs.save_learned(learned, folder / _MODEL)
+            _save_model(replace(learned, reasons=(str(error),)), folder)
             text = f"{error} ({folder / _MODEL} is written, without a report)"
             raise DataError(text) from error
         longest = min(arguments.steps, most_steps(learned, held_out, train))
@@ -306,7 +323,7 @@ def _make_report(
         notes.append(f"Judged {longest} ahead: {_of_more_than(longest)}.")
     if judgement.losses:
         lists["Where the model loses to what costs nothing"] = judgement.losses
-    else:
+    elif not _is_untold(judgement):
         notes.append(
             "The model loses to no baseline, by more than 2 % and more than chance."
         )
@@ -502,7 +519,7 @@ def _doubts(learned: IdentifiedModel, judgement: Judgement) -> list[str]:
     """Returns what must not be trusted."""
     nominal = learned.model.nominal
     doubts = [*_reasons_against(learned, judgement)]
-    if judgement.steps_not_told:
+    if judgement.steps_not_told and not _is_untold(judgement):
         doubts.append(_not_told(judgement))
     doubts += [
         f"Loses to a baseline: {loss}"

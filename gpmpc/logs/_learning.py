@@ -67,6 +67,8 @@ class IdentifiedModel:
     comparisons: tuple[Comparison, ...] = ()
     #: whether a controller can plan with it, where that was asked; no file keeps it
     control: ControlFitness | None = None
+    #: why it should not be used, as far as it was judged; none is no promise
+    reasons: tuple[str, ...] = ()
     #: what a system that it flies may call its states and inputs
     namings: Namings = NO_NAMINGS
 
@@ -255,5 +257,6 @@ def _identify(
         folds=folds,
         comparisons=comparisons,
         control=control,
+        reasons=control.faults if control is not None else (),
         namings=log.mapping.namings,
     )

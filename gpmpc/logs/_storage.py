@@ -4,6 +4,7 @@
 it in the file, is stored here.
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,6 +40,8 @@ from gpmpc.models._stored_values import texts
 from gpmpc.signals import UNKNOWN, Signals, signals_of
 from gpmpc.systems import System
 
+_log = logging.getLogger(__name__)
+
 
 @explains_arguments
 def save_learned(learned: IdentifiedModel, path: str | Path) -> None:
@@ -72,6 +75,7 @@ def save_learned(learned: IdentifiedModel, path: str | Path) -> None:
     ]
     header["judged_steps"] = learned.judged_steps
     header["folds"] = learned.folds
+    header["reasons"] = learned.reasons
     header["comparisons"] = [
         [one.name, one.ratio.tolist(), one.low.tolist(), one.high.tolist()]
         for one in learned.comparisons
@@ -141,8 +145,14 @@ def _learned_of_parts(
             Comparison(str(name), np.array(ratio), np.array(low), np.array(high))
             for name, ratio, low, high in header.get("comparisons", ())
         ),
+        reasons=_reasons_of(header),
         namings=named.namings,
     )
+
+
+def _reasons_of(header: Mapping[str, Any]) -> tuple[str, ...]:
+    """Returns why the model of a file should not be used; older files do not say."""
+    return texts("reasons", header.get("reasons", []))
 
 
 @dataclass(frozen=True)
@@ -212,6 +222,8 @@ def _are_called(own: Sequence[str], namings: Sequence[Sequence[str]]) -> bool:
 def load_flyable(path: str | Path, trusted: Sequence[str] | None = None) -> SavedModel:
     """Reads a model of any file, of ``gpmpc learn`` or of ``save_model``.
 
+    Warns of a model that should not be used, as the command that learned it said.
+
     Args:
         path: The file.
         trusted: Names of packages whose code the file may name; see ``load_model``.
@@ -228,6 +240,9 @@ def load_flyable(path: str | Path, trusted: Sequence[str] | None = None) -> Save
     packages = trusted_packages("model.trusted", trusted)
     header = load_metadata(path)
     model = load_model(path, packages)
+    with consistent(Path(path), "its reasons against the model are no texts"):
+        for reason in _reasons_of(header):
+            _log.warning("%s: do not use this model: %s", path, reason)
     signals = signals_of(model)
     if signals == UNKNOWN:
         with consistent(Path(path), "its metadata do not describe a model"):

@@ -13,7 +13,7 @@ import pytest
 
 from gpmpc.cli._learn import _fingerprint_of_call, _split, _StageResults
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.logs import Log, LogMapping, inspect_log
+from gpmpc.logs import Log, LogMapping, inspect_log, load_learned
 from gpmpc.logs._log import LogRun
 from gpmpc.plotting import inspection_figure, png
 
@@ -255,10 +255,15 @@ def test_runs_that_are_too_short_to_judge_on_are_refused_first(tmp_path):
     # A few rows more are learned from, and judged as far ahead as they tell.
     short.write_text("\n".join(["t,x,u", *rows, ""]))
     result = forked("learn", "map.yaml", "short.csv", "--for-control", cwd=tmp_path)
-    assert result.returncode in (0, 3), result.stderr
+    assert result.returncode == 3, result.stderr
+    assert "do not use this model: 1 steps ahead: too few held-out" in result.stderr
     assert "short log: rollouts of 2 steps decide, not of 50" in result.stdout
     assert "at most 1 steps ahead: of predictions more than 1 step" in result.stdout
-    assert "Judged 1 ahead" in (tmp_path / "learned" / "report.md").read_text()
+    report = (tmp_path / "learned" / "report.md").read_text()
+    assert "Judged 1 ahead" in report
+    assert "loses to no baseline" not in report
+    reasons = load_learned(tmp_path / "learned" / "model.safetensors").reasons
+    assert any("too few held-out rows to tell" in reason for reason in reasons)
 
 
 def run_of(rows, name="run"):

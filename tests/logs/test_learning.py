@@ -10,6 +10,7 @@ import numpy as np
 import pandas
 import pytest
 
+from gpmpc.cli._learn import _save_model
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.logs import (
     Log,
@@ -18,6 +19,7 @@ from gpmpc.logs import (
     inspect_log,
     judge,
     learn,
+    load_flyable,
     load_learned,
     read_log,
     save_learned,
@@ -269,7 +271,7 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
     )
 
 
-def test_a_model_is_the_same_after_saving_and_damage_is_named(tmp_path):
+def test_a_model_is_the_same_after_saving_and_damage_is_named(tmp_path, caplog):
     log = pendulum_log(lambda x: 9 * np.sin(x[0]) + 0.5 * x[1], rows=500)
     memory = {}
     learned = learn(log, points=40, steps=20, memory=memory)
@@ -287,6 +289,17 @@ def test_a_model_is_the_same_after_saving_and_damage_is_named(tmp_path):
     ]
     np.testing.assert_allclose(*variances, rtol=1e-6)
     assert [c.name for c in loaded.candidates] == [c.name for c in learned.candidates]
+    load_flyable(tmp_path / "model.safetensors")
+    assert not caplog.records
+    # One that should not be used says so, beside no report of another.
+    for name in ("report.html", "report.csv", "card.md"):
+        (tmp_path / name).write_text("of an earlier model")
+    _save_model(replace(learned, reasons=("no effect of u shows",)), tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["model.safetensors"]
+    loaded = load_learned(tmp_path / "model.safetensors")
+    assert loaded.reasons == ("no effect of u shows",)
+    load_flyable(tmp_path / "model.safetensors")
+    assert "do not use this model: no effect of u shows" in caplog.text
     (tmp_path / "cut.safetensors").write_bytes(
         (tmp_path / "model.safetensors").read_bytes()[:-100]
     )
