@@ -95,13 +95,17 @@ def _check(
     runs: Sequence[LogRun], step: float, claim: Claim, where: str
 ) -> list[Finding]:
     """Refuses states that another interpretation explains, or that nothing explains."""
+    run = runs[0].name
     windows = cut_motion_windows(runs, step, claim)
     if windows is None:
-        return []
+        text = (
+            "too few rows without a gap to tell whether axes, signs, units and orders "
+            "are those of the mapping"
+        )
+        return [Finding("unchecked", run, sum(map(len, runs)), text)]
     relations = MotionRelations(windows, claim)
     search = InterpretationSearch(relations)
     claimed = search.claimed()
-    run = runs[0].name
     if not _is_doubtful(relations, claimed):
         return _unusual(relations, claimed, run)
     candidates = sorted(search.candidates(), key=lambda candidate: candidate.score)

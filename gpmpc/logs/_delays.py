@@ -16,6 +16,7 @@ from gpmpc._dynamics import Array
 BLOCKS = 16
 BLOCK_ROWS = 4096  # at most
 LARGEST_LAG = 50  # rows
+MOST_CHANNELS = 64  # that are compared in pairs: more take minutes and gigabytes
 SHARP = 10  # rows within which a peak falls by a fifth
 CORRELATED = 0.5  # from which a delay says something
 _COLUMNS = [
@@ -62,13 +63,13 @@ def find_delays(names: Sequence[str], values: Array) -> list[Delay]:
     """Finds the delays of all pairs of channels whose differences are correlated.
 
     Args:
-        names: Of the channels.
+        names: Of the channels, of which the first ``MOST_CHANNELS`` are compared.
         values: Of the channels (K, c); NaN where a value is missing.
     """
     length = min(BLOCK_ROWS, len(values) // 8)
     if length < 4 * LARGEST_LAG:
         return []
-    steps = _differences(_without_units(values), length)
+    steps = _differences(_without_units(values[:, :MOST_CHANNELS]), length)
     norms = np.linalg.norm(steps, axis=1)
     usable = np.flatnonzero((norms > 0).all(axis=0))
     size = 1 << int(np.ceil(np.log2(steps.shape[1] + LARGEST_LAG)))

@@ -30,7 +30,7 @@ from gpmpc.logs._columns import (
     column_number,
     named_columns,
 )
-from gpmpc.logs._delays import Delay, delay_table, find_delays
+from gpmpc.logs._delays import MOST_CHANNELS, Delay, delay_table, find_delays
 from gpmpc.logs._file import Tables
 from gpmpc.logs._findings import Finding
 from gpmpc.logs._formats import read_file
@@ -242,7 +242,7 @@ def _read_with(mapping: LogMapping | None, path: str | Path) -> _Reading:
         return _Reading(warnings=[], dependence={})
     try:
         log = read_log(path, mapping, partial=True)
-    except DataError as error:
+    except (DataError, SettingError) as error:
         warning = f"with this mapping the log cannot be learned from: {error}"
         return _Reading(warnings=[warning], dependence={})
     warnings = [f"{finding.kind}: {finding.text}" for finding in log.findings]
@@ -320,11 +320,23 @@ def _inspect_stream(
         warnings=[
             *_stream_warnings(source.title, clock, steps, times),
             *_time_hints(source, times, constants, numbers),
+            *_warn_of_width(source.title, len(numbers)),
         ],
         text_columns=[
             _title(source.title, name) for name in columns if name not in numeric
         ],
     )
+
+
+def _warn_of_width(title: str, channels: int) -> list[str]:
+    """Says that delays are not looked for between all channels of a wide stream."""
+    if channels <= MOST_CHANNELS:
+        return []
+    of_topic = f" of {title}" if title else ""
+    return [
+        f"delays are looked for between the first {MOST_CHANNELS} of {channels} "
+        f"channels{of_topic}: a mapping says which channels count"
+    ]
 
 
 def _title(topic: str, column: Any) -> str:

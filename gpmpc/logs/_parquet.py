@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+# names that pandas gives the columns of an index without a name, which is the time in
+# many logs
+_INDEX_NAMES = {"__index_level_0__": "index", "__index_level_1__": "index 2"}
 _EXPANDING = "DELTA_BYTE_ARRAY"  # the encoding of texts that repeats their beginnings
 
 
@@ -108,5 +111,4 @@ def _as_frame(content: "pa.Table") -> pd.DataFrame:
     table = content.to_pandas(ignore_metadata=True)
     for name in table.select_dtypes("category"):
         table[name] = table[name].astype(object)
-    is_index = [name.startswith("__index_level_") for name in table.columns]
-    return table.loc[:, [not hidden for hidden in is_index]]
+    return table.rename(columns=_INDEX_NAMES)

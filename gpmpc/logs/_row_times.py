@@ -25,14 +25,14 @@ def time_unit(table: pd.DataFrame, column: str) -> str:
 
 
 def usual_time_column(table: pd.DataFrame) -> str:
-    """Finds a column that is called as times are; empty without one."""
+    """Finds a column that is called as times are, or holds dates; empty without one."""
     for name in TIMES:
         if name in table:
             return name
     for name in map(str, table):
         if unit_in_name(name):
             return name
-    return ""
+    return next((str(name) for name in table if holds_times(table, name)), "")
 
 
 def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array:

@@ -197,9 +197,9 @@ def _without_times(table: pd.DataFrame, mapping: LogMapping) -> str:
         )
     step = 1 / mapping.rate if mapping.rate else 0.1
     return (
-        f"column {column!r} is called as times are, and the mapping names no column of "
-        f"stamps: time: {{column: {column!r}}} takes it; time: {{step: {step:.6g}}} "
-        "counts the rows instead"
+        f"column {column!r} is called as times are, or holds them, and the mapping "
+        f"names no column of stamps: time: {{column: {column!r}}} takes it; time: "
+        f"{{step: {step:.6g}}} counts the rows instead"
     )
 
 

@@ -9,6 +9,7 @@ from gpmpc._trust import SYSTEM_CODE, package_of, trusted_code
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.logs._log import Log
 from gpmpc.logs._nominal_system import NominalSystem
+from gpmpc.models._namings import order_by_name
 from gpmpc.models._system_nominal import (
     FittedParameter,
     SystemNominal,
@@ -22,6 +23,7 @@ from gpmpc.systems import (
     LaggedDifferentialDrive,
 )
 
+STEERING = "steering"  # input of a bicycle
 HEADING = 2  # where the heading stands in the state of a vehicle
 _FULL_STEERING = 0.4  # [rad] of steering that has no unit, at its largest
 _POSITIVE = (  # parameters that are no sign of anything
@@ -110,11 +112,17 @@ def _nominal_of_vehicle(log: Log) -> SystemNominal:
 
 
 def _steering_scale(log: Log) -> float:
-    """Returns the angle [rad] of a unit of the first input."""
+    """Returns the angle [rad] of a unit of the steering.
+
+    It is the input that is called so, or the first one where none is.
+    """
+    order = order_by_name((STEERING, "drive"), log.mapping.namings.inputs)
+    steering = order[0] if order is not None else 0
     signals = log.mapping.of("inputs")
-    if signals[0].group.unit == "rad":
+    units = [signal.group.unit for signal in signals for _ in signal.group.entries]
+    if units[steering] == "rad":
         return 1.0
-    largest = max(float(np.abs(run.inputs[:, 0]).max()) for run in log)
+    largest = max(float(np.abs(run.inputs[:, steering]).max()) for run in log)
     return _FULL_STEERING / largest if largest > 0 else 1.0
 
 

@@ -64,6 +64,14 @@ def flight():
     return fly(seconds=14)
 
 
+def test_a_log_too_short_to_be_checked_says_so(tmp_path, flight):
+    table = flight.to_pandas()
+    few = table.iloc[: 9 * len(table) // 10 : 30].head(45)
+    (finding,) = read_log(stored(tmp_path, few), MAPPING).findings
+    assert finding.kind == "unchecked"
+    assert "too few rows without a gap to tell whether axes" in finding.text
+
+
 def negative(vectors, *axes):
     vectors = vectors.copy()
     vectors[:, axes] *= -1

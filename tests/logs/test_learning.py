@@ -10,7 +10,7 @@ import numpy as np
 import pandas
 import pytest
 
-from gpmpc.cli._learn import _save_model
+from gpmpc.cli._learn import _reasons_against, _save_model
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.logs import (
     Log,
@@ -260,6 +260,11 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
     assert few.steps_not_told == (10,)
     assert few.losses
     assert not any("10 steps ahead" in loss for loss in few.losses)
+    # Where nothing is told at any step, a model is not called usable.
+    untold = judge(learned, replace(held_out, runs=(rows,)), train, steps=(10,))
+    assert not untold.losses
+    (reason,) = _reasons_against(learned, untold)
+    assert "10 steps ahead: too few held-out rows to tell" in reason
     # Of short pieces the baselines are fitted to fewer steps.
     short = [replace(run, begins=tuple(range(0, 500, 70))) for run in train]
     train = replace(train, runs=tuple(short))

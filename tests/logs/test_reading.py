@@ -363,6 +363,19 @@ def test_dates_are_times_whatever_their_resolution(tmp_path, kind):
     assert inspection.streams.loc[0, "rate [Hz]"] == pytest.approx(50)
 
 
+def test_an_index_without_a_name_is_a_column(tmp_path):
+    table = pendulum_table().drop(columns="t")
+    table.index = pandas.date_range("2024-03-01", periods=len(table), freq="20ms")
+    table.to_parquet(tmp_path / "log.parquet")
+    mapping = {**PENDULUM, "time": "index"}
+    assert read_log(tmp_path / "log.parquet", mapping).time_step == pytest.approx(0.02)
+    del mapping["time"]
+    with pytest.raises(DataError, match="column 'index' is called as times are"):
+        read_log(tmp_path / "log.parquet", {**mapping, "rate": 10})
+    inspection = inspect_log(tmp_path / "log.parquet")
+    assert inspection.streams.loc[0, "rate [Hz]"] == pytest.approx(50)
+
+
 def test_a_unit_of_times_is_of_the_column_timestamp(tmp_path):
     table = pendulum_table().rename(columns={"t": "timestamp"})
     table["timestamp"] *= 1000

@@ -140,6 +140,18 @@ def test_steering_without_a_unit_is_one_that_turns_by_its_share(tmp_path):
     assert values["curvature"] == pytest.approx(3 / 5, rel=0.05)
 
 
+@pytest.mark.parametrize(("unit", "largest"), [("rad", 0.0), ("", 0.4)])
+def test_the_scale_of_the_steering_is_its_own_in_any_order(tmp_path, unit, largest):
+    inputs = excitation(200, (0, 0.15), (1.1, 0.3))
+    table = flight(kinematic_bicycle(0.02), inputs)
+    steering = {"columns": ["steering"], "unit": unit}
+    mapping = {**CAR, "inputs": {"drive": ["drive"], "steering": steering}}
+    structure = bases(log_of(tmp_path, table, mapping), 40)[0]
+    scale = structure.model.nominal.fixed["steering_scale"]
+    expected = largest / table["steering"].abs().max() if largest else 1.0
+    assert scale == pytest.approx(expected)
+
+
 def test_a_dynamic_bicycle_predicts_what_its_tyres_do(tmp_path):
     plant = dynamic_bicycle(
         0.02, front_stiffness=45, rear_stiffness=60, drive_gain=4, drag=0.8

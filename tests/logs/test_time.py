@@ -361,6 +361,9 @@ def test_an_inspection_reads_bags_in_any_order_and_what_is_whole(tmp_path):
         tmp_path / "arm.mcap", topics, order=np.random.default_rng(0).permutation
     )
     path.write_bytes(path.read_bytes()[:-1500])
+    mapping = LogMapping.from_dict({**BAG_MAPPING, "keep": {"battery": [10, None]}})
+    wrong = inspect_log(path, mapping)
+    assert any("cannot be learned from: keep" in text for text in wrong.warnings)
     inspection = inspect_log(path)
     assert list(inspection.streams["backward stamps"]) == [0, 0]
     assert any(warning.startswith("damaged: ") for warning in inspection.warnings)
