@@ -29,6 +29,7 @@ from gpmpc.exceptions import DataError, GpmpcError
 from gpmpc.logs._bag_clocks import choose_times
 from gpmpc.logs._encodings import UnreadError, find_decoder
 from gpmpc.logs._file import (
+    NAMES,
     NUMBER_BYTES,
     STAMP,
     TEXT_BYTES,
@@ -108,7 +109,11 @@ class _TopicTable:
             times: Of the messages, in the order of the file (K,) [s].
         """
         order = np.argsort(np.array(self.log_times), kind="stable")
-        frame = pd.DataFrame({STAMP: times} | self.arrays())
+        columns = self.arrays()
+        names = columns.get(NAMES)
+        if names is not None and (names == names[0]).all():
+            del columns[NAMES]
+        frame = pd.DataFrame({STAMP: times} | columns)
         return frame.iloc[order].reset_index(drop=True)
 
 

@@ -17,6 +17,7 @@ from gpmpc.logs._file import run_name
 from gpmpc.logs._findings import Finding
 
 SAME_CLOCK = 1.0  # [s] between two clocks that are taken for one
+LEAST_OFFSET = 0.02  # [s] from which on two clocks may not be one
 _STAMP_FIELDS = [  # seconds and nanoseconds, as ROS 2, ROS 1, Foxglove and protobuf say
     (f"{place}.{seconds}", f"{place}.{nanoseconds}")
     for place in ("header.stamp", "stamp", "timestamp")
@@ -76,13 +77,48 @@ def choose_times(
     }
     farthest = max(offsets, key=lambda topic: abs(offsets[topic]))
     if abs(offsets[farthest]) <= SAME_CLOCK:
-        return MessageTimes(times)
+        late = _late_stamps(path, offsets, reference, times)
+        return MessageTimes(times, late)
     text = (
         f"the stamps of {farthest} are {offsets[farthest]:.6g} s off the clock of "
         f"{reference}: all times are those of the log (stamp: header | log decides)"
     )
     finding = Finding("times of the log", run_name(path), 1, text)
     return MessageTimes(logged, (finding,))
+
+
+def _late_stamps(
+    path: Path,
+    offsets: Mapping[str, float],
+    reference: str,
+    times: Mapping[str, Array],
+) -> tuple[Finding, ...]:
+    """Returns the findings of topics whose stamps are off the reference by a row.
+
+    That may be the time that a message takes from its stamp to the log, or clocks of
+    two computers that are not synchronised.
+
+    Args:
+        path: Of the file.
+        offsets: [s] by topic.
+        reference: The topic that they are of.
+        times: Of the messages [s], by topic.
+    """
+    findings = []
+    for topic, offset in offsets.items():
+        step = (
+            np.nanmedian(np.abs(np.diff(times[topic]))) if len(times[topic]) > 1 else 0
+        )
+        if abs(offset) <= max(step, LEAST_OFFSET):
+            continue
+        side = "behind" if offset < 0 else "ahead of"
+        text = (
+            f"the stamps of {topic} are {abs(offset):.3g} s {side} the clock of "
+            f"{reference}, as the log sees them: are their clocks the same? (stamp: "
+            "header | log decides)"
+        )
+        findings.append(Finding("stamps apart", run_name(path), 1, text))
+    return tuple(findings)
 
 
 def _clock_offset(

@@ -4,14 +4,15 @@ Another encoding is entered in ``find_decoder``.
 """
 
 import json
-from collections.abc import Callable, Iterable
+import zlib
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from mcap.records import Channel, Schema
 
 from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import GpmpcError
-from gpmpc.logs._file import MOST_COLUMNS, first_line, needs_extra
+from gpmpc.logs._file import MOST_COLUMNS, NAMES, first_line, needs_extra
 from gpmpc.logs._ros2 import LISTED, Cells, Decode, ros2_decoder
 from gpmpc.logs._ros_definitions import idl_as_msg
 
@@ -110,6 +111,7 @@ def _collect(
     fields_of: Callable[[Any], _Fields | None],
 ) -> None:
     """Collects the numbers of a message and of those inside it."""
+    lists: list[Sequence[Any]] = []
     for name, value in fields_of(message) or ():
         path = f"{prefix}{name}"
         if isinstance(value, bool | int | float):
@@ -120,8 +122,20 @@ def _collect(
             for i, entry in enumerate(value):
                 if isinstance(entry, bool | int | float):
                     cells[f"{path}[{i}]"] = float(entry)
+            lists.append(value)
         if len(cells) > MOST_COLUMNS:
             raise ValueError(f"it holds more than {MOST_COLUMNS} numbers")
+    names = _names_of_entries(lists)
+    if names:
+        text = repr(names).encode()
+        cells[NAMES] = float(zlib.crc32(text, int(cells.get(NAMES, 0))))
+
+
+def _names_of_entries(lists: Sequence[Sequence[Any]]) -> list[list[str]]:
+    """Returns the lists of texts that are as long as a list of numbers beside them."""
+    texts = [[*one] for one in lists if all(isinstance(entry, str) for entry in one)]
+    lengths = {len(one) for one in lists if len(one) and not isinstance(one[0], str)}
+    return [one for one in texts if len(one) in lengths]
 
 
 def _is_short_list(value: Any) -> bool:

@@ -14,6 +14,9 @@ from gpmpc.recording import Flaw
 #: column of the times [s] that a message carries or was logged at; no field of a
 #: message has this name
 STAMP = "(stamp)"
+#: column of a number for each list of texts that messages carry, such as the names of
+#: joints, where these are not the same in all messages
+NAMES = "(names)"
 NUMBER_BYTES = 32  # of a number in a table, and of its copies on the way there
 TEXT_BYTES = 64  # of a short text in a table, or of another Python object
 MOST_COLUMNS = 4096  # of a table; with many more, pandas takes seconds for any

@@ -31,7 +31,7 @@ from gpmpc.logs._columns import (
     named_columns,
 )
 from gpmpc.logs._delays import MOST_CHANNELS, Delay, delay_table, find_delays
-from gpmpc.logs._file import Tables
+from gpmpc.logs._file import NAMES, Tables
 from gpmpc.logs._findings import Finding
 from gpmpc.logs._formats import read_file
 from gpmpc.logs._log import Log
@@ -321,6 +321,7 @@ def _inspect_stream(
             *_stream_warnings(source.title, clock, steps, times),
             *_time_hints(source, times, constants, numbers),
             *_warn_of_width(source.title, len(numbers)),
+            *_warn_of_names(source),
         ],
         text_columns=[
             _title(source.title, name) for name in columns if name not in numeric
@@ -339,6 +340,17 @@ def _warn_of_width(title: str, channels: int) -> list[str]:
     ]
 
 
+def _warn_of_names(source: _Source) -> list[str]:
+    """Says that entries of lists are not the same in all messages of a topic."""
+    if NAMES not in source.table:
+        return []
+    count = source.table[NAMES].nunique(dropna=False)
+    return [
+        f"messages of {source.title} carry {count} different lists of names: entries "
+        "of its lists, [0], [1], ..., are not the same in all of them"
+    ]
+
+
 def _title(topic: str, column: Any) -> str:
     return f"{topic}.{column}" if topic else str(column)
 
@@ -347,7 +359,7 @@ def _columns_of_interest(
     source: _Source, time_name: str, mapping: LogMapping | None
 ) -> list[Any]:
     """Lists the columns beside the time; with a mapping, those of its signals."""
-    columns = [name for name in source.table if name != time_name]
+    columns = [name for name in source.table if name not in (time_name, NAMES)]
     if mapping is None:
         return columns
     signals = [signal for signal in mapping.signals if signal.topic == source.topic]

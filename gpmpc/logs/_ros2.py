@@ -9,11 +9,12 @@ https://wiki.ros.org/msg (ROS 1: the same numbers one after the other, without g
 
 import re
 import struct
+import zlib
 from collections.abc import Callable
 from typing import NamedTuple
 
 from gpmpc._bounds import MemoryBudget
-from gpmpc.logs._file import MOST_COLUMNS, TEXT_BYTES
+from gpmpc.logs._file import MOST_COLUMNS, NAMES, TEXT_BYTES
 
 LISTED = 64  # entries of a list that become columns, at most
 _STEP = 1024  # of a step of a plan [bytes]
@@ -197,17 +198,23 @@ class _Message:
         self.budget = budget
         self.order = _PLAIN_CDR[kind]
         self.position = 4
+        self.names: dict[int, int] = {}  # checksums of lists of texts, by length
 
     def numbers(self, plan: list[_Step]) -> Cells:
         """Reads all numbers but those of lists of more than ``LISTED`` entries."""
         cells: Cells = {}
+        lengths = set()
         for step in plan:
             values = self.values(step)
             if step.is_list:
+                lengths.add(len(values))
                 for i, value in enumerate(values):
                     cells[f"{step.path}[{i}]"] = float(value)
             elif values:
                 cells[step.path] = float(values[0])
+        names = [self.names[length] for length in sorted(lengths & self.names.keys())]
+        if names:
+            cells[NAMES] = float(sum(names))
         return cells
 
     def values(self, step: _Step) -> tuple[float, ...]:
@@ -227,7 +234,11 @@ class _Message:
         if step.type == "string":
             self.budget.take(TEXT_BYTES * count, "the texts of its messages")
             for _ in range(count):
-                self.scalars("B", self.length())
+                length = self.length()
+                self.scalars("B", length)
+                if step.is_list:
+                    text = self.data[self.position - length : self.position]
+                    self.names[count] = zlib.crc32(text, self.names.get(count, 0))
             return ()
         inner = self.plan(step.type)
         self.budget.take(TEXT_BYTES * count * len(inner), "the lists of its messages")
@@ -270,6 +281,7 @@ class _PackedMessage(_Message):
         self.budget = budget
         self.order = "<"
         self.position = 0
+        self.names: dict[int, int] = {}
 
     def begin(self, size: int) -> int:
         """Returns where the next number begins: behind the one before."""

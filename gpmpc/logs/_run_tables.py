@@ -1,6 +1,6 @@
 """Makes one table of a run: the signals of all its topics on one grid of times."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from gpmpc.logs._clocks import (
     find_jumps,
     ordered_stamps,
 )
-from gpmpc.logs._file import STAMP, Tables
+from gpmpc.logs._file import NAMES, STAMP, Tables
 from gpmpc.logs._findings import RunFindings
 from gpmpc.logs._mapping import LogMapping, Signal
 from gpmpc.logs._resampling import (
@@ -118,12 +118,31 @@ def _read_topic(
         times = times[has_time]
     stamps = ordered_stamps(times, where, hint)
     signals = [signal for signal in mapping.signals if signal.topic == topic]
+    _check_names(where, table, signals)
     ordered = table.iloc[stamps.rows]
     measured = ordered
     if any((signal.held or mapping.held) != "use" for signal in signals):
         measured = nan_zero_dropouts(where, ordered, signals, findings)
     _note_stamps(topic, stamps, mapping, findings)
     return _Topic(where=where, table=measured, stamps=stamps)
+
+
+def _check_names(where: str, table: pd.DataFrame, signals: Sequence[Signal]) -> None:
+    """Raises ``DataError`` where entries of lists are not the same in all messages.
+
+    Two nodes that publish on one topic, such as the drivers of an arm and of its
+    gripper, have joints of their own.
+    """
+    if NAMES not in table:
+        return
+    entries = [c for signal in signals for c in signal.columns if c.endswith("]")]
+    if entries:
+        raise DataError(
+            f"{where}: its messages carry {table[NAMES].nunique(dropna=False)} "
+            f"different lists of names, so that {entries[0]} is not the same in all of "
+            "them: does more than one node publish on the topic? record a topic for "
+            "each"
+        )
 
 
 def _note_units(

@@ -1,5 +1,6 @@
 """Bags are read by what their channels say, and what is not read is counted."""
 
+import json
 import struct
 import sys
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer as PlainWriter
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 from pyulog import ULog
@@ -14,7 +16,7 @@ from pyulog import ULog
 sys.path.append(str(Path(__file__).resolve().parents[2]))
 from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import DataError
-from gpmpc.logs import read_log
+from gpmpc.logs import inspect_log, read_log
 from gpmpc.logs._formats import read_file
 from gpmpc.logs._ros2 import ros2_decoder
 from tests.logs import strange
@@ -363,3 +365,61 @@ def test_a_rewritten_recording_is_still_a_recording(tmp_path):
     file = read_file(tmp_path / "cut.mcap", [""], partial=True)
     assert "it was not finished" in findings(file)["unfinished"][1]
     assert 0 < len(file.tables[""]) <= len(expected)
+
+
+def joint_states(encoding):
+    """Returns how two drivers publish joints, their joints and their positions."""
+    if encoding == "json":
+
+        def encode(names, positions):
+            message = {"name": names, "position": positions}
+            return json.dumps(message).encode()
+
+        return strange.Encoder("my/Joints", "json", "jsonschema", b"{}", encode)
+
+    def encode(names, positions):
+        data = struct.pack("<I", len(names))
+        for name in names:
+            data += b"\0" * (-len(data) % 4)
+            data += struct.pack("<I", len(name) + 1) + name.encode() + b"\0"
+        data += b"\0" * (-len(data) % 4) + struct.pack("<I", len(positions))
+        data += b"\0" * (-len(data) % 8) + struct.pack(
+            f"<{len(positions)}d", *positions
+        )
+        return b"\0\1\0\0" + data
+
+    definition = b"string[] name\nfloat64[] position"
+    return strange.Encoder("my/Joints", "cdr", "ros2msg", definition, encode)
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "json"])
+@pytest.mark.parametrize("others", [["finger"], ["elbow", "shoulder"]])
+def test_joints_of_two_drivers_are_not_one_column(tmp_path, encoding, others):
+    encoder = joint_states(encoding)
+    joints = ["shoulder", "elbow"]
+    mapping = {
+        "rate": 50,
+        "states": {"q": {"topic": "/joints", "columns": ["position[0]"]}},
+    }
+    for lists in ([joints, joints], [joints, others]):
+        with (tmp_path / "arm.mcap").open("wb") as file:
+            writer = PlainWriter(file)
+            writer.start()
+            schema = writer.register_schema(
+                encoder.name, encoder.definition, encoder.schema
+            )
+            channel = writer.register_channel("/joints", encoder.message, schema)
+            for k in range(200):
+                names = lists[k % 2]
+                positions = [np.sin(0.1 * k + joint) for joint in range(len(names))]
+                data = encoder.encode(names, positions)
+                time = 10**9 + 10**7 * k
+                writer.add_message(channel, time, data, time, k)
+            writer.finish()
+        if lists[0] is lists[1]:
+            assert len(read_log(tmp_path / "arm.mcap", mapping)) == 100
+            continue
+        with pytest.raises(DataError, match="carry 2 different lists of names"):
+            read_log(tmp_path / "arm.mcap", mapping)
+        warnings = inspect_log(tmp_path / "arm.mcap").warnings
+        assert any("carry 2 different lists of names" in text for text in warnings)

@@ -212,6 +212,27 @@ def test_topics_with_and_without_a_header_have_time_in_common(tmp_path):
         read_log(path, {**BAG_MAPPING, "stamp": "header"})
 
 
+@pytest.mark.parametrize(
+    ("header", "offset", "text"),
+    [
+        (True, -0.4, "the stamps of /motor are 0.4 s ahead of the clock of /arm"),
+        (True, 0.1, "the stamps of /motor are 0.1 s behind the clock of /arm"),
+        (False, -0.4, "the stamps of /arm are 0.401 s behind the clock of /motor"),
+    ],
+)
+def test_clocks_that_are_less_than_a_second_apart_are_a_finding(
+    tmp_path, header, offset, text
+):
+    topics = strange.pendulum_topics(ROWS)
+    arm = topics["/arm"]
+    topics["/arm"] = arm._replace(stamps=arm.stamps + offset)
+    if not header:
+        topics["/motor"] = topics["/motor"]._replace(stamps=None)
+    log = read_log(strange.write_bag(tmp_path / "arm.mcap", topics), BAG_MAPPING)
+    (finding,) = [f for f in log.findings if f.kind == "stamps apart"]
+    assert finding.text.startswith(text)
+
+
 def test_topics_of_two_clocks_take_the_times_of_the_log(tmp_path):
     topics = strange.pendulum_topics(ROWS)
     stamps = topics["/arm"].stamps - 5.0
