@@ -39,6 +39,7 @@ from gpmpc.studies.study import fingerprint
 
 _MODEL = "model.safetensors"
 _JUDGED_STEPS = (1, 10, 50)  # ahead, besides the longest
+_LONG_TO_READ = 10_000_000  # bytes
 _EXIT_UNUSABLE = 3  # of a model that is written, and should not be used
 _NOISE_IN_WORDS = (
     "the noise of the outputs, which adds up, and that of the sensors, which does not, "
@@ -55,6 +56,7 @@ def learn(arguments: argparse.Namespace) -> Result:
     console = Console(soft_wrap=True, highlight=False, markup=False)
     folder = arguments.to or Path("learned")
     find_modules_here()  # which a mapping may name a system of
+    _say_what_is_read(arguments.files, console)
     log = logs.read_log(arguments.files, arguments.mapping, arguments.partial)
     console.print(repr(log))
     for finding in log.findings:
@@ -96,6 +98,13 @@ def learn(arguments: argparse.Namespace) -> Result:
         "rows": report.data.to_dict("records"),
     }
     return Result(data, _EXIT_UNUSABLE if reasons else 0)
+
+
+def _say_what_is_read(files: Sequence[Path], console: Console) -> None:
+    """Prints how much is read, which may take minutes."""
+    size = sum(Path(file).stat().st_size for file in files if Path(file).is_file())
+    if size >= _LONG_TO_READ:
+        console.print(f"reading {len(files)} files, {size / 1e6:.0f} MB")
 
 
 def _reasons_against(learned: IdentifiedModel, judgement: Judgement) -> tuple[str, ...]:

@@ -263,7 +263,9 @@ def _first_row(lines: Sequence[Fields], delimiter: str) -> int:
     for index, fields in enumerate(lines):
         is_first = index == 0 and len(lines) > 1
         is_header = is_first and (
-            _names_numbers(fields, lines[1]) or _counts_columns(fields)
+            _names_numbers(fields, lines[1])
+            or _counts_columns(fields)
+            or _counts_from_zero(fields, lines[1])
         )
         fits = len(fields) == usual_width
         if delimiter != WHITE_SPACE and not fits:
@@ -292,6 +294,15 @@ def _counts_columns(fields: Fields) -> bool:
     return len(counted) > 1 and fields[0] == "" and fields[1:] == counted
 
 
+def _counts_from_zero(fields: Fields, below: Fields) -> bool:
+    """Tells whether a line holds 0, 1, ..., as pandas writes it without an index.
+
+    The row below, which has a decimal point, is no such line.
+    """
+    counted = [str(number) for number in range(len(fields))]
+    return len(counted) > 2 and fields == counted and any("." in one for one in below)
+
+
 def _find_header(
     lines: Sequence[str],
     comments: Sequence[str],
@@ -308,7 +319,8 @@ def _find_header(
     """
     if not rows:
         return _Header(_split_line(lines[0], delimiter), units=[], skipped=0)
-    if lines and _counts_columns(_split_line(lines[-1], delimiter)):
+    last = _split_line(lines[-1], delimiter) if lines else []
+    if lines and (_counts_columns(last) or _counts_from_zero(last, rows[0])):
         # other numbers than a mapping counts by
         return _Header([], units=[], skipped=len(lines))
     for separators in ((delimiter,), DELIMITERS):

@@ -1,5 +1,6 @@
 """Reads log files as a ``Log``: files to tables, to runs, to usable rows."""
 
+import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
@@ -77,6 +78,7 @@ def read_log(
             runs.append(run)
     _check_content(runs, paths, findings)
     _note_unlike_entries(runs, mapping, findings)
+    _note_equal_runs(runs, findings)
     if mapping.model == "rigid_body":
         runs, remarks = read_rigid_bodies(runs, step, mapping)
         findings += remarks
@@ -159,6 +161,22 @@ def _note_unlike_entries(
             "hardly counts; name a signal for each quantity"
         )
         findings.append(Finding("unlike entries", runs[0].name, len(states), text))
+
+
+def _note_equal_runs(runs: Sequence[LogRun], findings: list[Finding]) -> None:
+    """Notes runs with the rows of another: one that is held out is no new one."""
+    first_of_content: dict[bytes, str] = {}
+    for run in runs:
+        digest = hashlib.sha256()
+        for values in (run.states, run.inputs, run.context):
+            digest.update(np.ascontiguousarray(values).tobytes())
+        first = first_of_content.setdefault(digest.digest(), run.name)
+        if first != run.name:
+            text = (
+                f"has the rows of run {first}: held out from it, it shows nothing; "
+                "leave one of them out"
+            )
+            findings.append(Finding("equal runs", run.name, len(run), text))
 
 
 def _check_content(

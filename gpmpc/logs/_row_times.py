@@ -8,10 +8,11 @@ from gpmpc.exceptions import DataError
 from gpmpc.logs._file import STAMP
 from gpmpc.logs._mapping import TIME_UNITS, LogMapping
 from gpmpc.logs._signals import holds_times, read_column, seconds
-from gpmpc.logs._units import unit_in_name, units_of
+from gpmpc.logs._units import unit_at_end, unit_in_name, units_of
 
 # columns that hold the time where nobody says which
 TIMES = (STAMP, "timestamp", "t", "time", "stamp", "Time", "seconds")
+LATEST_UNSTATED = 1e11  # [s] since 1970, in the year 5138
 LONGEST_UNSTATED = 3600.0  # [s] between rows whose stamps nobody gave a unit
 
 
@@ -21,7 +22,9 @@ def time_unit(table: pd.DataFrame, column: str) -> str:
     It stands in a line of units, or in the column's name.
     """
     stated = units_of(table).get(column, "")
-    return stated if stated in TIME_UNITS else unit_in_name(column)
+    if stated in TIME_UNITS:
+        return stated
+    return unit_in_name(column) or unit_at_end(column)
 
 
 def usual_time_column(table: pd.DataFrame) -> str:
@@ -72,11 +75,18 @@ def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array
 def _check_unstated_unit(where: str, times: Array, column: str) -> None:
     """Raises ``DataError`` of times (K,) [s] that are rather of a smaller unit."""
     steps = np.diff(times[np.isfinite(times)])
-    if not len(steps) or np.median(steps) <= LONGEST_UNSTATED:
+    if not len(steps):
+        return
+    step = np.median(steps)
+    if step > LONGEST_UNSTATED:
+        doubt = f"rows are {step:.3g} s apart"
+    elif np.nanmedian(times) > LATEST_UNSTATED:
+        doubt = "rows are of a year after 5000"
+    else:
         return
     raise DataError(
-        f"{where}: rows are {np.median(steps):.3g} s apart if {column} is in s: in "
-        f"which unit is it? (time: {{column: {column}, unit: us}}, or s, ms, ns)"
+        f"{where}: {doubt} if {column} is in s: in which unit is it? (time: {{column: "
+        f"{column}, unit: us}}, or s, ms, ns)"
     )
 
 

@@ -106,6 +106,7 @@ class Search:
         past_rows = past_rows_needed(most_rows_back, delay_rows)
         self._held_out = HeldOutErrors(log, folds, kinematics, past_rows, steps)
         self.judged_steps = self._held_out.judged_steps
+        progress(f"smoothing the rows of {len(folds)} folds")
         self._fits = StructureFits(
             log=log,
             folds=folds,

@@ -69,6 +69,7 @@ _TIME_WITH_UNIT = re.compile(
     r"(?:[Tt]ime|[Tt]imestamp|t)(?: ?[\[(](s|ms|us|ns)[\])]|_(s|ms|us|ns))"
 )
 _TIME_US = "TimeUS"
+_ENDS_WITH_UNIT = re.compile(r".*_(ms|us|ns|msec|usec|nsec)")  # time_boot_ms
 _NAME_WITH_UNIT = re.compile(r".*\S ?(?:\[([^\[\]]+)\]|\(([^()]+)\))")
 _FACTOR = re.compile(r"([A-Za-z%]+)\^?((?:-?\d)?)")
 
@@ -118,6 +119,16 @@ def unit_in_name(column: str) -> str:
         return "us"
     match = _TIME_WITH_UNIT.fullmatch(column)
     return (match[1] or match[2]) if match is not None else ""
+
+
+def unit_at_end(time: str) -> str:
+    """Returns the unit at the end of the name of what is a time; empty for none.
+
+    >>> unit_at_end("time_boot_ms"), unit_at_end("time_usec"), unit_at_end("items")
+    ('ms', 'us', '')
+    """
+    match = _ENDS_WITH_UNIT.fullmatch(time)
+    return match[1].removesuffix("ec") if match is not None else ""
 
 
 def unit_in_brackets(name: str) -> str:

@@ -126,6 +126,21 @@ def test_what_cannot_be_read_is_refused_by_name(tmp_path, content, reason):
         read_log(tmp_path / "log.csv", MAPPING)
 
 
+def test_counted_columns_are_no_row(tmp_path):
+    (tmp_path / "log.csv").write_text("0,1,2\n" + TEXT.partition("\n")[2])
+    mapping = {"time": 1, "states": {"x": [2]}, "inputs": {"u": [3]}}
+    log = read_log(tmp_path / "log.csv", mapping)
+    np.testing.assert_array_equal(log.runs[0].states[:, 0], TABLE["x"])
+
+
+def test_a_run_that_comes_twice_is_found(tmp_path):
+    for name in ("flight.csv", "flight (1).csv"):
+        (tmp_path / name).write_text(TEXT)
+    log = read_log([tmp_path / "flight.csv", tmp_path / "flight (1).csv"], MAPPING)
+    (finding,) = log.findings
+    assert (finding.kind, finding.run) == ("equal runs", "flight (1)")
+
+
 def test_a_column_may_hold_a_comment_sign_in_its_name(tmp_path):
     table = parse(tmp_path, "t,motor#1\n0,1\n1,2\n")
     assert list(table) == ["t", "motor#1"]

@@ -325,6 +325,8 @@ SIGNALS = {"states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
         ("t,x,u\nms,m,N\n", {"time": "t", **SIGNALS}),
         ("t,x,u\n(ms),(m),(N)\n\n", {"time": "t", **SIGNALS}),
         ("t_ms,x,u\n", {"time": 1, **SIGNALS}),
+        ("time_boot_ms,x,u\n", {"time": "time_boot_ms", **SIGNALS}),
+        ("elapsed_msec,x,u\n", {"time": "elapsed_msec", **SIGNALS}),
         ("t_ms,x,u\n", {"time": "t", "names": ["t"], **SIGNALS}),
         ("t [ms],x,u\n", {"time": "T", "runs": {"a": {"T": "t [ms]"}}, **SIGNALS}),
     ],
@@ -335,6 +337,13 @@ def test_the_unit_that_a_file_says_of_its_times_is_taken(tmp_path, header, mappi
     log = read_log(tmp_path / "a.csv", mapping)
     assert log.time_step == pytest.approx(0.02)
     assert not kinds(log)
+
+
+def test_stamps_of_a_far_year_are_in_another_unit(tmp_path):
+    rows = [f"{1_700_000_000_000 + 20 * k},{k % 7},{k % 3}\n" for k in range(60)]
+    (tmp_path / "a.csv").write_text("t,x,u\n" + "".join(rows))
+    with pytest.raises(DataError, match="a year after 5000 if t is in s: in which"):
+        read_log(tmp_path / "a.csv", {"time": "t", **SIGNALS})
 
 
 def test_the_time_step_in_a_column_has_the_unit_that_the_file_says(tmp_path):
