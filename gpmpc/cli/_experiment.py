@@ -71,7 +71,11 @@ def _merge(config: DictConfig) -> DictConfig:
 
 
 def _complete_systems(config: DictConfig) -> None:
-    """Makes whole systems of what a nominal system and a plant differ in."""
+    """Makes whole systems of what a nominal system and a plant differ in.
+
+    The settings of a plant repeat those of its system, so that each can be set: a
+    plant that differs in none is the system itself.
+    """
     with open_dict(config):
         nominal = config.nominal
         if nominal and "_target_" not in nominal:

@@ -189,8 +189,8 @@ def _name_lines(
 ) -> None:
     """Names a panel of one line by its axis, one of several by words beside them."""
     if len(names) == 1:
-        words = names_in_words(system.pose, system.z_down)
-        axis.set_ylabel(name_of(names[0], panel.unit, words))
+        labels = names_in_words(system.pose, system.z_down)
+        axis.set_ylabel(name_of(names[0], panel.unit, labels))
         return
     axis.set_ylabel(f"[{figure_label(panel.unit)}]")
     legend = axis.legend(

@@ -66,10 +66,10 @@ def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
 def _unplanned_noise(run: "Run") -> np.ndarray:
     """Returns standard deviations (n,) of the noise that the plans leave out."""
     n = len(run.state_names)
-    words = run.metadata.get("run", {}).get("noise_std", "").split()
-    if len(words) != n:
+    deviations = run.metadata.get("run", {}).get("noise_std", "").split()
+    if len(deviations) != n:
         return np.zeros(n)
-    return np.array(words, dtype=float)
+    return np.array(deviations, dtype=float)
 
 
 class _Tracked(NamedTuple):
@@ -140,7 +140,7 @@ def _tracked_states(run: "Run") -> list[_Tracked]:
     """
     settings = run.metadata.get("run", {})
     units = run.metadata.get("units", {})
-    words = _names_in_words(run)
+    labels = _names_in_words(run)
     angles = settings.get("angles", "").split()
     tracked_names = [*settings.get("tracked", "").split(), *angles]
     all_names = list(run.state_names)
@@ -160,7 +160,7 @@ def _tracked_states(run: "Run") -> list[_Tracked]:
         unit = units.get(f"state.{name}", "")
         tracked_states.append(
             _Tracked(
-                title=name_of(name, unit, words),
+                title=name_of(name, unit, labels),
                 unit=unit,
                 gaps=gaps_of(run),
                 jumps=turns_of(reference) if name in angles else np.empty(0, int),
@@ -241,7 +241,7 @@ def inputs_figure(run: "Run") -> Figure:
     check_run(run)
     m = len(run.input_names)
     units = run.metadata.get("units", {})
-    words = _names_in_words(run)
+    labels = _names_in_words(run)
     figure, axes = make_figure(
         width=7.2,
         height=1.6 * m + 1.0,
@@ -259,7 +259,7 @@ def inputs_figure(run: "Run") -> Figure:
             label="applied",
         )
         _draw_bounds(axis, values, run.input_bounds[:, i])
-        axis.set_ylabel(name_of(name, units.get(f"input.{name}", ""), words))
+        axis.set_ylabel(name_of(name, units.get(f"input.{name}", ""), labels))
         _mark_failures(run, axis)
     axes[-1, 0].set_xlabel("time [s]")
     legend_below(figure, axes.flat)

@@ -82,22 +82,22 @@ def names_in_words(pose: Mapping[str, str], z_down: bool) -> dict[str, str]:
         pose: Which states say where it is and how it is turned, by x, ..., roll, ...
         z_down: Whether its z axis points downwards.
     """
-    words = {
+    labels = {
         state: axis for axis, state in pose.items() if axis in ("roll", "pitch", "yaw")
     }
     if z_down and pose:
-        words |= _INPUTS_IN_WORDS
+        labels |= _INPUTS_IN_WORDS
     if z_down and "z" in pose:
-        words[pose["z"]] = f"{figure_label(pose['z'])}, downwards"
-    return words
+        labels[pose["z"]] = f"{figure_label(pose['z'])}, downwards"
+    return labels
 
 
-def name_of(name: str, unit: str = "", words: Mapping[str, str] | None = None) -> str:
+def name_of(name: str, unit: str = "", labels: Mapping[str, str] | None = None) -> str:
     """Returns the name of a state or input with its unit, as ``z, downwards [m]``.
 
-    ``words`` are those of ``names_in_words``.
+    ``labels`` are those of ``names_in_words``.
     """
-    full = (words or {}).get(name, figure_label(name))
+    full = (labels or {}).get(name, figure_label(name))
     unit = figure_label(unit)
     return f"{full} [{unit}]" if unit not in ("", "1", "?") else full
 

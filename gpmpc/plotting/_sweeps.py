@@ -131,12 +131,12 @@ class _PositionScale:
 
     def limits(self) -> np.ndarray:
         """Returns the values of the axis between which it is drawn (2,)."""
-        first = self.coordinates[0]
-        last = self.coordinates[-1]
+        lowest = self.coordinates[0]
+        highest = self.coordinates[-1]
         margin = 0.5 * self.gap
         if self.has_numbers:
-            margin = max(margin, 0.06 * (last - first))
-        return self.to_axis(np.array([first - margin, last + margin]))
+            margin = max(margin, 0.06 * (highest - lowest))
+        return self.to_axis(np.array([lowest - margin, highest + margin]))
 
 
 def _position_scale(positions: Sequence[str]) -> _PositionScale:

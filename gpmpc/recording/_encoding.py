@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 _STATE_ARRAYS = ("reference", "state", "measured", "innovation")  # (n,) of a step
-_PROGRAM_ARRAYS = ("P", "q", "G", "lower", "upper")
+_PROGRAM_ARRAYS = ("P", "q", "G", "lower", "upper")  # as ``Solution.arrays`` has them
 _STATUS_NUMBERS = {status: number for number, status in enumerate(Status)}
 
 
@@ -76,10 +76,10 @@ class StepCopy:
     def arrays(self) -> dict[str, Array]:
         """Views of the copy by name: of the step, its plan, solution and program."""
         ends = np.cumsum([math.prod(shape) for shape in self._shapes.values()])
-        parts = np.split(np.frombuffer(self.data), ends[:-1])
+        flat = np.split(np.frombuffer(self.data), ends[:-1])
         return {
-            name: part.reshape(shape)
-            for part, (name, shape) in zip(parts, self._shapes.items(), strict=True)
+            name: values.reshape(shape)
+            for values, (name, shape) in zip(flat, self._shapes.items(), strict=True)
         }
 
     @property
@@ -113,7 +113,7 @@ def _arrays_of_decision(decision: "Decision", record_problem: bool) -> dict[str,
     if not record_problem:
         return arrays
     if solution is not None:
-        arrays |= zip(_PROGRAM_ARRAYS, solution.arrays, strict=False)
+        arrays |= zip(_PROGRAM_ARRAYS, solution.arrays, strict=True)
         arrays["caps"] = solution.caps
     elif program is not None:
         for name in _PROGRAM_ARRAYS:

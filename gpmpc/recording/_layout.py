@@ -60,18 +60,18 @@ def layout(run: Run) -> str:
         "minLogLevel": 1,
         "topicToRender": "/log",
     }
-    left: str | dict[str, Any] = _LOG_PANEL
-    left_share = 25  # [%]
+    column: str | dict[str, Any] = _LOG_PANEL  # on the left
+    column_width = 25  # [%]
     if "/pose" in run.channels:
         panels[_SCENE_PANEL] = _scene("Position" in groups, "Attitude" in groups)
-        left = _split("column", _SCENE_PANEL, _LOG_PANEL, 78)
-        left_share = 50
+        column = _split("column", _SCENE_PANEL, _LOG_PANEL, 78)
+        column_width = 50
     content = {
         "configById": panels,
         "globalVariables": {},
         "userNodes": {},
         "playbackConfig": {"speed": 1},
-        "layout": _split("row", left, _PLOTS_PANEL, left_share),
+        "layout": _split("row", column, _PLOTS_PANEL, column_width),
     }
     return json.dumps(content, indent=1) + "\n"
 

@@ -59,11 +59,11 @@ def _count_flaws(content: FileContent, present: int, where: str) -> list[Flaw]:
         text = f"{recorded.number} steps were recorded by its end; there are {present}"
         flaws.append(Flaw(WRONG_COUNT, present - recorded.number, text))
     if present < recorded.number:
-        lost = recorded.number - present
-        text = f"{lost} of {recorded.text} steps are lost"
+        missing = recorded.number - present
+        text = f"{missing} of {recorded.text} steps are lost"
         if where:
             text += f": {where}"
-        flaws.append(Flaw(LOST_STEPS, lost, text))
+        flaws.append(Flaw(LOST_STEPS, missing, text))
     return flaws
 
 

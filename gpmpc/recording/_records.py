@@ -148,7 +148,13 @@ def _listed(places: list[int]) -> str:
 
 
 class _DataReader:
-    """A reader that goes once from the beginning of a file to the end of its data."""
+    """A reader that goes once from the beginning of a file to the end of its data.
+
+    ``_position`` is where the next record is expected. ``_search.begin``, where a
+    search for a chunk would begin, is never beyond it: after the last chunk that was
+    whole, or known to be lost. The records between the two were read by their lengths;
+    where one of these was wrong, a chunk may stand among them.
+    """
 
     def __init__(self, file: BinaryIO, path: Path):
         self._file = file
@@ -253,7 +259,12 @@ class _DataReader:
         return frame.kind in _DATA_KINDS
 
     def _end(self, frame: Frame, checksum: int) -> None:
-        """Compares the checksum of all data with that of the record that ends them."""
+        """Compares the checksum of all data with that of the record that ends them.
+
+        Args:
+            frame: That record.
+            checksum: Of all data before it.
+        """
         self._ended = True
         self._data_checksum = stored_checksum(frame.content)
         self._checksum_is_right = agrees(self._data_checksum, checksum)

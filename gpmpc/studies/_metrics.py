@@ -14,7 +14,7 @@ from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc.problem import Box, Halfspaces, Inequality, Problem
 from gpmpc.simulation import Rollout
 from gpmpc.studies._experiment import Experiment
-from gpmpc.studies._flight import Flown, errors_of, rmse
+from gpmpc.studies._trial import Flown, errors_of, rmse
 
 #: parts of the time of a decision
 DECISION_STAGES = ("model", "build", "solve", "total")

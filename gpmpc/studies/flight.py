@@ -8,9 +8,9 @@ plain data, and ``summary`` says the metrics in words.
 """
 
 from gpmpc.studies._experiment import Experiment
-from gpmpc.studies._flight import Flown, run_trial
 from gpmpc.studies._metrics import metrics
 from gpmpc.studies._outlook import Outlook
 from gpmpc.studies._summary import summary
+from gpmpc.studies._trial import Flown, run_trial
 
 __all__ = ["Experiment", "Flown", "Outlook", "metrics", "run_trial", "summary"]

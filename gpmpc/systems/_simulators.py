@@ -33,8 +33,8 @@ def numbers(x: Any, u: Any) -> tuple[Array, Array]:
     try:
         return np.array(x, dtype=float), np.array(u, dtype=float)
     except (TypeError, ValueError, NotImplementedError) as error:
-        what = "a simulator has no equations: take a controller on a learned model"
-        raise SettingError("controller", what) from error
+        remedy = "a simulator has no equations: take a controller on a learned model"
+        raise SettingError("controller", remedy) from error
 
 
 class Simulator:
@@ -67,10 +67,10 @@ class Simulator:
         if (
             self._now is None or not np.array_equal(state, self._now)
         ) and not self._set(state):
-            what = "this simulator cannot be set to a state"
             raise SettingError(
                 "system",
-                f"{what}: it takes no process noise and starts where it starts",
+                "this simulator cannot be set to a state: it takes no process noise "
+                "and starts where it starts",
             )
         self._now, self.ended = self._step(input)
         return self._now.copy()

@@ -215,11 +215,11 @@ class System:
 
     def _check_lost(self) -> None:
         """Raises unless ``lost`` has positive distances of units that are tracked."""
-        lost = self.lost
-        if not isinstance(lost, Mapping):
-            lost = {self.unit: lost}
+        distances = self.lost
+        if not isinstance(distances, Mapping):
+            distances = {self.unit: distances}
         units = list(self.tracked_by_unit)
-        for unit, distance in lost.items():
+        for unit, distance in distances.items():
             if unit not in units:
                 raise SettingError(
                     "lost",
@@ -237,6 +237,7 @@ class System:
         self._set_floats("input_upper", inputs, default=(inf,) * m)
         self._set_floats("initial_input", inputs, default=(0.0,) * m)
         self._set_floats("goal", states, default=(0.0,) * n)
+        # A start that nobody gave is where the reference begins, which a flight knows.
         self._set_floats("start", states, default=None)
         limits = zip(self.input_lower, self.input_upper, strict=True)
         if any(lower > upper for lower, upper in limits):
@@ -359,9 +360,9 @@ class System:
         positions = trajectory(times)
         states = np.tile(np.array(self.goal), (count, 1))
         if positions.shape[1:] != (len(self.tracked),):
-            what = f"must prescribe {', '.join(self.tracked)} of {self.name}"
+            rule = f"must prescribe {', '.join(self.tracked)} of {self.name}"
             raise ShapeError(
-                f"trajectory: {what}; got positions of {positions.shape[-1]} numbers"
+                f"trajectory: {rule}; got positions of {positions.shape[-1]} numbers"
             )
         states[:, self.tracked_indices] = positions
         if self.rates:
@@ -392,9 +393,9 @@ class System:
         if not (
             hasattr(self.dynamics, "derivative") or hasattr(self.dynamics, "successor")
         ):
-            what = "must have derivative(x, u), or successor(x, u) for the next state"
+            rule = "must have derivative(x, u), or successor(x, u) for the next state"
             raise SettingError(
-                "dynamics", f"{what}; got {type(self.dynamics).__name__}"
+                "dynamics", f"{rule}; got {type(self.dynamics).__name__}"
             )
         if self.stateful:
             return
@@ -407,9 +408,9 @@ class System:
         except Exception as error:
             if advice := dynamics_advice(error, ("torch",)):  # math takes floats
                 raise SettingError("dynamics", advice) from error
-            what = f"must step from state {x} with input {u}"
+            rule = f"must step from state {x} with input {u}"
             raise SettingError(
-                "dynamics", f"{what}; got {type(error).__name__}: {error}"
+                "dynamics", f"{rule}; got {type(error).__name__}: {error}"
             ) from error
         for name, entry in zip(self.state_names, entries, strict=True):
             if not isfinite(entry):

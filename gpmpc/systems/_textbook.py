@@ -20,11 +20,11 @@ class _Body:
     """Checks that every number is positive; those in ``may_be_zero`` may be zero."""
 
     may_be_zero: tuple[str, ...] = ()
-    words: tuple[str, ...] = ()  # attributes that are no numbers
+    choices: tuple[str, ...] = ()  # attributes that are no numbers
 
     def __post_init__(self) -> None:
         for key, value in vars(self).items():
-            if key in self.words:
+            if key in self.choices:
                 continue
             numbers = value if isinstance(value, tuple | list) else [value]
             for number in numbers:
@@ -213,7 +213,7 @@ class DoublePendulum(_Body):
 
     state_names = ("shoulder", "shoulder_rate", "elbow", "elbow_rate")
     input_names = ("torque",)
-    words = ("actuated",)
+    choices = ("actuated",)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -344,11 +344,12 @@ class PlanarQuadrotor(_Body):
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (x, vx, y, vy, tilt, tilt_rate) [m/s, m/s^2, rad/s, rad/s^2]."""
         vx, vy, tilt, tilt_rate = x[1], x[3], x[4], x[5]
-        right, left = u[0], u[1]
-        lift = (right + left) / self.mass
+        thrust_right = u[0]
+        thrust_left = u[1]
+        lift = (thrust_right + thrust_left) / self.mass
         vx_dot = -lift * sin(tilt)
         vy_dot = lift * cos(tilt) - GRAVITY
-        tilt_rate_dot = self.arm * (right - left) / self.inertia
+        tilt_rate_dot = self.arm * (thrust_right - thrust_left) / self.inertia
         return [vx, vx_dot, vy, vy_dot, tilt_rate, tilt_rate_dot]
 
 

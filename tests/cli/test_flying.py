@@ -85,7 +85,7 @@ def test_a_run_that_nobody_can_write_down_has_failed(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "disk full")
 
     jobs = jobs_of(tmp_path, "flies", "flies")
-    monkeypatch.setattr(RunFolder, "lose", refuse)
+    monkeypatch.setattr(RunFolder, "end_from_outside", refuse)
     launcher = Told(tmp_path, {"cause": Cause.ERROR, "reason": "cannot write"})
     flying, states = flown(launcher, jobs)
     assert states == {"0-flies": "failed", "1-flies": "finished"}

@@ -19,7 +19,7 @@ from gpmpc.mpc.baselines import NMPC
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise
 from gpmpc.status import Status
-from gpmpc.studies import _flight
+from gpmpc.studies import _trial
 from gpmpc.studies._run_folder import Busy, RunFolder, folder_name
 from gpmpc.studies.flight import Experiment, metrics, run_trial
 from gpmpc.systems import coupled, pendulum, rotational, translational
@@ -326,7 +326,7 @@ def test_the_rehearsal_changes_no_bit(choice, learned, monkeypatch):
             experiment_of(compose("run", overrides=[choice, *tiny, *noise]))
         )
     rehearsed = run_trial(settings).rollout
-    monkeypatch.setattr(_flight, "rehearse", lambda *_: None)
+    monkeypatch.setattr(_trial, "rehearse", lambda *_: None)
     at_once = run_trial(settings).rollout
     for name in (
         "states",

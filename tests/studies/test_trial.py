@@ -14,7 +14,7 @@ from gpmpc.gp import Trainer, Transitions
 from gpmpc.learning import EpisodicLearning, OnlineLearning
 from gpmpc.mpc import PredictionSettings, Problem, Tracking
 from gpmpc.simulation import ModelLoop, Noise
-from gpmpc.studies import _experiment, _flight
+from gpmpc.studies import _experiment, _trial
 from gpmpc.studies.flight import Experiment, Flown, run_trial
 from gpmpc.studies.study import random_rows
 from gpmpc.systems import pendulum, translational
@@ -48,9 +48,9 @@ def experiment(**changes):
 def loops(monkeypatch):
     """What was rehearsed, and what was flown, in their order."""
     calls = []
-    monkeypatch.setattr(_flight, "rehearse", lambda *arguments: calls.append(arguments))
+    monkeypatch.setattr(_trial, "rehearse", lambda *arguments: calls.append(arguments))
     monkeypatch.setattr(
-        _flight,
+        _trial,
         "closed_loop",
         lambda *arguments, **keywords: calls.append((arguments, keywords)) or ROLLOUT,
     )
@@ -119,7 +119,7 @@ def test_a_controller_that_knows_the_plant_is_made_of_it(loops):
 
 @pytest.mark.parametrize("propagator", [None, "mine"])
 def test_a_model_loop_is_flown_in_the_models_own_world(propagator, loops, monkeypatch):
-    monkeypatch.setattr(_flight, "best_propagator", lambda model: ("best for", model))
+    monkeypatch.setattr(_trial, "best_propagator", lambda model: ("best for", model))
     run_trial(
         experiment(
             loop="model", propagator=propagator, system=translational(time_step=0.25)
@@ -134,7 +134,7 @@ def test_a_model_loop_is_flown_in_the_models_own_world(propagator, loops, monkey
 
 def test_a_controller_that_learns_while_it_flies_is_wrapped(loops, monkeypatch):
     monkeypatch.setattr(
-        _flight, "LearningController", lambda *arguments: steering(arguments=arguments)
+        _trial, "LearningController", lambda *arguments: steering(arguments=arguments)
     )
     online = OnlineLearning()
     run_trial(experiment(learning=online))
@@ -148,7 +148,7 @@ def test_a_diverged_flight_is_its_flown_part_or_raises(loops, monkeypatch):
     def diverge(*_, **__):
         raise error
 
-    monkeypatch.setattr(_flight, "closed_loop", diverge)
+    monkeypatch.setattr(_trial, "closed_loop", diverge)
     with pytest.raises(Diverged):
         run_trial(experiment())
     error.rollout = ROLLOUT
@@ -180,7 +180,7 @@ def test_a_recording_sees_how_its_flight_ends(loops, monkeypatch):
         assert on_step is STEP
         raise error
 
-    monkeypatch.setattr(_flight, "closed_loop", diverge)
+    monkeypatch.setattr(_trial, "closed_loop", diverge)
     assert run_trial(experiment(), open_recording).diverged is error
     assert ends == ["complete", "step 3: away"]
 
@@ -200,9 +200,9 @@ def test_episodes_have_own_seeds_and_the_best_model_flies_last(monkeypatch):
 
     monkeypatch.setattr(Experiment, "training_rows", lambda _: ["rows"])
     monkeypatch.setattr(Experiment, "learn", learn)
-    monkeypatch.setattr(_flight, "_fly", fly)
+    monkeypatch.setattr(_trial, "_fly", fly)
     monkeypatch.setattr(
-        _flight, "rmse", lambda _, flown: errors[int(flown.rollout[-1]) - 1]
+        _trial, "rmse", lambda _, flown: errors[int(flown.rollout[-1]) - 1]
     )
     monkeypatch.setattr(
         EpisodicLearning, "with_flight", lambda _, data, rollout: [*data, rollout]
