@@ -71,6 +71,16 @@ class _ActingState(NamedTuple):
     next_pending: Array  # inputs on their way, after the step (..., D m)
 
 
+def _over_batch(values: Array, batch: tuple[int, ...]) -> Array:
+    """Returns values (..., k) repeated over a batch (*batch, k), as a view.
+
+    ``broadcast_to`` is slow beside a step of few windows, and mostly not needed.
+    """
+    if values.shape[:-1] == batch:
+        return values
+    return np.broadcast_to(values, (*batch, values.shape[-1]))
+
+
 @dataclass(frozen=True, eq=False)
 class LogModel:
     """A model of the outputs behind a log: a nominal part and what is learned on it.
@@ -166,20 +176,15 @@ class LogModel:
             nominal[..., list(self.without_nominal)] = 0.0
         return nominal
 
-    def learned_outputs(
-        self, states: Array, inputs: Array, context: Array, memory: Array
-    ) -> Array | float:
+    def learned_outputs(self, features: Array, memory: Array) -> Array | float:
         """Computes what the linear term and the GPs add to the outputs (..., o).
 
         Args:
-            states: (..., n).
-            inputs: (..., m), as they act.
-            context: (..., c).
+            features: (..., d); see ``features``.
             memory: What is remembered (..., s).
         """
         if not self.gps and not self.weights.size:
             return 0.0
-        features = self.features(states, inputs, context)
         y = np.zeros((*features.shape[:-1], len(self.history)))
         regressors = features
         if self.weights.size or not self.memory.empty:
@@ -194,8 +199,8 @@ class LogModel:
     def features(self, states: Array, inputs: Array, context: Array) -> Array:
         """Returns the features (..., d) of states, inputs and context."""
         batch = states.shape[:-1]
-        inputs = np.broadcast_to(inputs, (*batch, inputs.shape[-1]))
-        context = np.broadcast_to(context, (*batch, context.shape[-1]))
+        inputs = _over_batch(inputs, batch)
+        context = _over_batch(context, batch)
         return self.kinematics.features(states, inputs, context)
 
     def outputs(
@@ -218,7 +223,8 @@ class LogModel:
         if memory is None:
             memory = np.empty((*states.shape[:-1], 0))
         nominal = self.nominal_outputs(states, inputs, context, theta)
-        return nominal + self.learned_outputs(states, inputs, context, memory)
+        features = self.features(states, inputs, context)
+        return nominal + self.learned_outputs(features, memory)
 
     def carried_dim(self, input_dim: int, context_dim: int = 0) -> int:
         """Returns the number of entries that are carried on beside a state."""
@@ -269,14 +275,15 @@ class LogModel:
         """
         now = self._acting_now(carried, inputs, time_step, time_constants)
         states = now.states
-        context = np.broadcast_to(context, (*states.shape[:-1], context.shape[-1]))
-        learned = self.learned_outputs(states, now.inputs, context, now.memory)
+        context = _over_batch(context, states.shape[:-1])
+        features = self._features_of_step(now, context)
+        learned = self.learned_outputs(features, now.memory)
         beyond_nominal = learned + disturbance
         nominal = self.nominal_outputs(states, now.inputs, context, theta)
         outputs = nominal + beyond_nominal
         after = self.kinematics.step(states, outputs, time_step)
         beyond_nominal = np.broadcast_to(beyond_nominal, outputs.shape)
-        return self._carry_on(now, after, context, beyond_nominal)
+        return self._carry_on(now, after, features, beyond_nominal)
 
     def follow(
         self,
@@ -296,10 +303,11 @@ class LogModel:
             time_step: [s].
         """
         now = self._acting_now(carried, inputs, time_step)
-        context = np.broadcast_to(context, (*measured.shape[:-1], context.shape[-1]))
+        context = _over_batch(context, measured.shape[:-1])
+        features = self._features_of_step(now, context)
         outputs = self.kinematics.outputs(now.states, measured, time_step)
         modelled = self.nominal_outputs(now.states, now.inputs, context)
-        return self._carry_on(now, measured, context, outputs - modelled)
+        return self._carry_on(now, measured, features, outputs - modelled)
 
     def at_rest(self, states: Array, inputs: Array, context: Array) -> Array:
         """Returns a state with all that is carried on, as if it had stood there.
@@ -329,7 +337,7 @@ class LogModel:
         """Returns the inputs that act in a step, beside the parts of a state."""
         m = inputs.shape[-1]
         parts = self.parts(carried, m)
-        inputs = np.broadcast_to(inputs, (*carried.shape[:-1], m))
+        inputs = _over_batch(inputs, carried.shape[:-1])
         queue = np.concatenate([parts.pending, inputs], axis=-1)
         acting = queue[..., :m]
         lagged = parts.lagged
@@ -345,20 +353,25 @@ class LogModel:
             next_pending=queue[..., m:],
         )
 
+    def _features_of_step(self, now: "_ActingState", context: Array) -> Array:
+        """Returns the features (..., d) of a step; none where nothing sees them."""
+        if not self.gps and not self.weights.size and self.memory.empty:
+            return now.states[..., :0]
+        return self.features(now.states, now.inputs, context)
+
     def _carry_on(
-        self, now: "_ActingState", after: Array, context: Array, beyond_nominal: Array
+        self, now: "_ActingState", after: Array, features: Array, beyond_nominal: Array
     ) -> Array:
         """Returns next states with all that is carried on.
 
         Args:
             now: The step.
             after: Next states (..., n).
-            context: (..., c).
+            features: Of the step (..., d).
             beyond_nominal: What the nominal part left of the outputs (..., o).
         """
         memory = now.memory
         if not self.memory.empty:
-            features = self.features(now.states, now.inputs, context)
             memory = self.memory.step(memory, features, beyond_nominal)
         parts = [after, now.next_lagged, now.next_pending, memory]
         return np.concatenate(parts, axis=-1)
@@ -539,15 +552,25 @@ class LogModel:
             SettingError: The windows have too few rows before their starts.
         """
         n = self.kinematics.space.dim
-        predicted = self.rollout_carried(windows, steps, theta)[..., 1:, :n]
+        predicted = self.rollout_carried(windows, steps, theta, kept=n)[..., 1:, :]
         if self.correction is None or theta is not None:
             return predicted
         return self.correction(windows, predicted)
 
     def rollout_carried(
-        self, windows: Windows, steps: int | None = None, theta: Array | None = None
+        self,
+        windows: Windows,
+        steps: int | None = None,
+        theta: Array | None = None,
+        kept: int | None = None,
     ) -> Array:
         """Predicts as ``rollout``, with the start and all that is carried on.
+
+        Args:
+            windows: As in ``rollout``.
+            steps: Likewise.
+            theta: Likewise.
+            kept: Number of entries that are returned, the first ones; all by default.
 
         Returns:
             (W, 1 + steps, n + ...), or (T, W, 1 + steps, n + ...).
@@ -581,7 +604,7 @@ class LogModel:
                 time_constants=time_constants,
             )
 
-        return iterate(step, carried, steps)
+        return iterate(step, carried, steps, kept)
 
     def rollout_errors(
         self, windows: Windows, steps: Sequence[int] | np.ndarray | None = None

@@ -32,23 +32,32 @@ from gpmpc.gp._posterior import AffineForm
 from gpmpc.models._features import Features
 
 
-def iterate(step: Callable[[int, Array], Array], start: Array, steps: int) -> Array:
+def iterate(
+    step: Callable[[int, Array], Array],
+    start: Array,
+    steps: int,
+    kept: int | None = None,
+) -> Array:
     """Iterates x[k+1] = step(k, x[k]).
 
     Args:
         step: Maps the stage k and states x[k] (..., n) to x[k+1] (..., n).
         start: x[0] (..., n).
         steps: Number of iterations.
+        kept: Number of entries of each state that are returned, the first ones; all by
+            default.
 
     Returns:
-        x[0], .., x[steps] (..., steps + 1, n).
+        x[0], .., x[steps] (..., steps + 1, kept).
     """
-    states = np.empty((*start.shape[:-1], steps + 1, start.shape[-1]))
-    states[..., 0, :] = start
+    if kept is None:
+        kept = start.shape[-1]
+    states = np.empty((*start.shape[:-1], steps + 1, kept))
+    states[..., 0, :] = start[..., :kept]
     state = start
     for k in range(steps):
         state = step(k, state)
-        states[..., k + 1, :] = state
+        states[..., k + 1, :] = state[..., :kept]
     return states
 
 
