@@ -50,10 +50,10 @@ def iterate(
     Returns:
         x[0], .., x[steps] (..., steps + 1, kept).
     """
-    if kept is None:
-        kept = start.shape[-1]
-    states = np.empty((*start.shape[:-1], steps + 1, kept))
-    states[..., 0, :] = start[..., :kept]
+    kept_start = start[..., :kept]
+    *batch, n = kept_start.shape
+    states = np.empty((*batch, steps + 1, n))
+    states[..., 0, :] = kept_start
     state = start
     for k in range(steps):
         state = step(k, state)
