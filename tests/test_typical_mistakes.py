@@ -796,6 +796,10 @@ OF_A_KIND = {
         lambda: data()["position"],
         "rows: must be whole numbers or a slice; columns are in states and inputs",
     ),
+    "a single row": (
+        lambda: data()[0],
+        "rows: must be whole numbers or a slice; columns are in states and inputs; got",
+    ),
     "a system as a known model": (
         lambda: KnownModel(PLANT, 2, 1),
         "function: must be a function of tensors; got System",

@@ -66,7 +66,8 @@ class ColumnDescriptions(NamedTuple):
             outputs = _numbered("output", output_count)
         magnitudes = None
         if predicts == "difference":
-            magnitudes = features[:, :output_count].abs().amax(dim=0).numpy()
+            largest = features[:, :output_count].abs().amax(dim=0)
+            magnitudes = largest.numpy(force=True)
         return cls(features=states + inputs, outputs=outputs, magnitudes=magnitudes)
 
     @classmethod

@@ -36,7 +36,7 @@ from gpmpc.gp._gpytorch_checks import (
     training_features,
 )
 from gpmpc.gp._tensor_checks import Predicts, check_columns
-from gpmpc.signals import UNKNOWN, Signals, signals_of
+from gpmpc.signals import UNKNOWN, Signals, check_signals, signals_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,11 +82,13 @@ class KernelPosterior(TensorModel):
                 positive definite.
         """
         parts = [_FrozenModel.freeze(one) for one in exact_models(model, likelihood)]
+        signals = signals_of(model) if signals is None else signals
+        check_signals(signals)
         posterior = cls(
             parts=tuple(parts),
             input_dim=input_dim,
             predicts=predicts,
-            signals=signals_of(model) if signals is None else signals,
+            signals=signals,
         )
         widths = sorted({part.features.shape[-1] for part in parts})
         if len(widths) > 1:

@@ -28,11 +28,14 @@ Differences and length-scales are read, without the formula, in
 ``testing/_propagator``. ``_kernels.GPArrays`` are made in ``_packed.pack``,
 ``Window.empty`` and ``models/_roll_out._compiled_tape``. ``SparseTrainer`` hands its
 settings on to ``Trainer`` in ``_exact_trainer``; ``gp/_gpytorch.to_gpytorch`` makes an
-RBF kernel of any posterior. A kernel that is SE-ARD over sines and cosines, a periodic
-one, is no new kernel: it is what ``models.Features`` makes of an angle.
+RBF kernel of any posterior. ``models.Features`` makes sine and cosine of an angle: with
+one length-scale for both that would be the periodic kernel of a turn, but training
+chooses two.
 
 Its parameters stand elsewhere too: rows theta = (log l, log sf, log(sf / sn)) in
-``Hyperparameters``, ``gp._search``, ``gp._training_data`` and ``gp._sparse_training``;
+``Hyperparameters``, ``gp._search``, ``gp._training_data``, ``gp._sparse_training`` and
+``estimation._noise._prior_penalty``; its tensors in ``GPPosterior``,
+``check_gp_tensors``, ``gp._storage`` and, one after the other, in ``gp._sparse``;
 the kernel's name in files, ``gp._storage`` ("SE-ARD", where they are written and read);
 and what ``from_gpytorch`` takes for it, ``gp._gpytorch._check_se_ard``. ``1 / l^2`` and
 log sf2 travel packed (``_kernels.GPArrays``), from which ``learning._changed_model``

@@ -72,7 +72,8 @@ class NegativeLogMarginalLikelihood:
         weights, value = self._weights_and_value(factor)
         # K^-1 = L^-T L^-1
         inverse, _ = lapack.dlauum(_triangular_inverse(factor), lower=1, overwrite_c=1)
-        # The upper triangle, with zeros below.
+        # LAPACK sees the transpose: ``inverse`` is lower there, W is upper here, with
+        # zeros below.
         W = blas.dsyr(-1.0, weights, a=inverse, lower=1, overwrite_a=1).T
         trace = W.trace()
         M = np.multiply(W, signal, out=W)

@@ -276,6 +276,7 @@ class GPPosterior(TensorModel):
         nominal = (self.signal_variance + self.noise_variance)[:, None]
         if self._is_round_off(diagonal - nominal):
             return self.noise_variance
+        # Of the matrix that was factorised the diagonal and the first column are asked.
         noise = diagonal.mean(-1) - self.signal_variance
         if len(self) == 1:
             # a pseudo-observation sums up several rows: its noise is less than theirs

@@ -101,7 +101,7 @@ class SoftLimits:
 
 
 class SearchSettings(Protocol):
-    """The settings of a trainer that its searches use; see ``Trainer``."""
+    """The settings of ``Trainer`` and ``SparseTrainer`` that searches use."""
 
     @property
     def penalty(self) -> Penalty | None: ...
@@ -189,11 +189,11 @@ class OutputSearch:
         self._settings = settings
         self._deadline = deadline
         self._constant = features.constant
-        self._log_prior = np.log(_prior_lengthscales(features))
-        self._log_scales = np.log(_search_lengthscales(features))
+        self._log_constant_lengthscales = np.log(_prior_lengthscales(features))
+        self._log_box_centre = np.log(_search_lengthscales(features))
         self._log_output = np.log(output_std(targets))
         self._box = search_box(
-            self._log_scales, self._log_output, settings.signal_to_noise_limit
+            self._log_box_centre, self._log_output, settings.signal_to_noise_limit
         )
         # Of the points of the present search; ``_use_points`` sets both.
         self._likelihood: NegativeLogMarginalLikelihood
@@ -233,7 +233,7 @@ class OutputSearch:
             )
         theta = best.theta.copy()
         # The likelihood says nothing of a constant feature: the prior does.
-        theta[:-2][self._constant] = self._log_prior[self._constant]
+        theta[:-2][self._constant] = self._log_constant_lengthscales[self._constant]
         explored = [optimum.objective for optimum in optima]
         explored += [math.nan] * (len(starts) - len(optima))
         return SearchResult(theta, best.objective, explored)
@@ -247,8 +247,10 @@ class OutputSearch:
         deviations of the features: among the data the output is known, far from them it
         is not. A single row leaves the noise open as well: that of the plain start.
         """
-        log_lengthscales = self._log_scales + np.log(_SMOOTH)
-        log_lengthscales[self._constant] = self._log_prior[self._constant]
+        log_lengthscales = self._log_box_centre + np.log(_SMOOTH)
+        log_lengthscales[self._constant] = self._log_constant_lengthscales[
+            self._constant
+        ]
         signal = max(deviation, np.abs(self._targets).max())
         ratio = min(_REPEATED, self._settings.signal_to_noise_limit)
         if len(self._targets) == 1:
@@ -265,8 +267,10 @@ class OutputSearch:
         self, first: np.ndarray | None, perturbations: np.ndarray
     ) -> list[np.ndarray]:
         """The points where the exploration begins."""
-        plain = np.append(self._log_scales, [self._log_output, np.log(_PLAIN_RATIO)])
-        longer = np.append(np.full(len(self._log_scales), _LONGER), [0.0, 0.0])
+        plain = np.append(
+            self._log_box_centre, [self._log_output, np.log(_PLAIN_RATIO)]
+        )
+        longer = np.append(np.full(len(self._log_box_centre), _LONGER), [0.0, 0.0])
         starts = [plain if first is None else first]
         starts += [plain + longer + shift for shift in perturbations]
         return starts
@@ -318,7 +322,7 @@ class OutputSearch:
         with np.errstate(over="ignore", invalid="ignore"):
             value, gradient = self._likelihood(theta)
             if self._settings.penalty is not None:
-                penalty, slope = self._settings.penalty(theta, self._log_scales)
+                penalty, slope = self._settings.penalty(theta, self._log_box_centre)
                 value = value + penalty
                 gradient = gradient + slope
         self.evaluations += 1

@@ -24,6 +24,7 @@ from gpmpc.exceptions import (
 )
 from gpmpc.gp._data_checks import (
     RESOLUTION,
+    ROUND_OFF,
     ColumnDescriptions,
     checked_targets,
     constant_columns,
@@ -128,8 +129,9 @@ class Trainer:
     #: sn = std(y) / 10
     restarts: int = 3
     #: of more points than this a random subset of as many is searched first, from all
-    #: starts; the search over all points goes on from its best. None searches over all
-    #: of them from every start
+    #: starts; the search over all points goes on from its best. An output that stands
+    #: still in the subset has rows added in which it moves. None searches over all of
+    #: them from every start
     subset: int | None = 1000
     tolerance: float = 1e-8  #: relative decrease of the objective where L-BFGS stops
     #: the box holds sf / sn within this factor of one. Moment matching needs sf2 / sn2
@@ -317,7 +319,8 @@ class Trainer:
             with threadpool_limits(1 if size < _ONE_THREAD else None, user_api="blas"):
                 deviation = _deviation_of_constant(data, a)
                 if deviation is None:
-                    results.append(search(first[a], perturbations[a, 1:], rows))
+                    first_rows = _with_moving_rows(rows, targets[:, a])
+                    results.append(search(first[a], perturbations[a, 1:], first_rows))
                 else:
                     results.append(search.result_of_constant(deviation))
             evaluations += search.evaluations
@@ -363,12 +366,12 @@ class Trainer:
             return [None] * data.targets.shape[1]
         check_posterior("start", start)
         theta = scaled_theta(start, data.feature_scaling, data.target_scaling)
-        start_features = start.features.cpu().double().numpy()
+        start_features = start.features.double().numpy(force=True)
         was_constant = constant_columns(start_features, self.resolution)
         no_longer_constant = was_constant & ~data.constant.features
         log_scales = np.log(features.scales)
         theta[:, :-2][:, no_longer_constant] = log_scales[no_longer_constant]
-        targets = start.targets.cpu().double().numpy()
+        targets = start.targets.double().numpy(force=True)
         outputs_were_constant = constant_columns(
             targets, self.resolution, data.columns.magnitudes
         )
@@ -437,6 +440,29 @@ def _search_features(data: TrainingData) -> SearchFeatures:
         constant=data.constant.features,
         prior_lengthscales=data.prior.lengthscales / factor,
     )
+
+
+def _with_moving_rows(
+    rows: np.ndarray | slice, targets: np.ndarray
+) -> np.ndarray | slice:
+    """Adds rows that move to those that are searched first, if none of these does.
+
+    An output that moves in few rows only, as at a contact, may be constant in a random
+    subset. Its optimum there is noise, out of which the search over all rows does not
+    find. At most half as many rows are added, those that differ most.
+
+    Args:
+        rows: Indices of a subset, or ``ALL_ROWS``.
+        targets: One output's (N,).
+    """
+    if isinstance(rows, slice):
+        return rows
+    differences = np.abs(targets - targets[rows[0]])
+    moves = differences > ROUND_OFF * differences.max()
+    if moves[rows].any():
+        return rows
+    largest = np.argsort(differences)[-max(len(rows) // 2, 1) :]
+    return np.union1d(rows, largest[moves[largest]])
 
 
 def _deviation_of_constant(data: TrainingData, output: int) -> float | None:

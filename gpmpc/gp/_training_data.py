@@ -31,7 +31,7 @@ _NAMED_COLUMNS = 6  # columns that a line of the log names; of more it says how 
 
 
 class DataSettings(Protocol):
-    """The settings of a trainer that say how it reads its data; see ``Trainer``."""
+    """The settings of ``Trainer`` and ``SparseTrainer`` by which data are read."""
 
     @property
     def scaling(self) -> Callable[[Tensor, Sequence[str]], Scaling]: ...
@@ -182,7 +182,7 @@ def scaled_theta(
         (signal_variance.sqrt() / target_scaling.factor).log(),
         (signal_variance / noise_variance).log() / 2,
     ]
-    return torch.column_stack(theta).numpy()
+    return torch.column_stack(theta).numpy(force=True)
 
 
 def _warn_of_constants(data: TrainingData, resolution: float) -> None:

@@ -147,9 +147,11 @@ class Transitions:
 
     def __getitem__(self, rows: slice | Sequence[int]) -> "Transitions":
         """Returns the transitions of some rows, in their order."""
-        if isinstance(rows, str):
+        if isinstance(rows, str | int | np.integer):
             rule = "must be whole numbers or a slice; columns are in states and inputs"
             raise SettingError("rows", f"{rule}; got {rows!r}")
+        if isinstance(rows, slice) and (rows.step or 1) < 0:  # torch takes none
+            rows = list(range(len(self))[rows])
         return Transitions(
             self.states[rows], self.inputs[rows], self.next_states[rows], self.signals
         )
@@ -238,6 +240,7 @@ class Transitions:
                 are the states' names with a prefix or suffix. None, or an empty list,
                 takes the file for one recording at equal time steps: the next row's
                 states are the next states, and the last row only serves as such.
+                Empty lines do not count, nor part recordings.
             time_step: Between the two states of a row [s], where it is known.
 
         Raises:
@@ -360,7 +363,8 @@ def _real_next(values: Any, states: Any, signals: Signals) -> Tensor:
     order = order_of(_without_affixes(labels, ours), ours)
     if order is not None and table.dim() == 2:
         return table[:, order]
-    if not (names_of(values) and signals.state_names):  # numbers of columns say nothing
+    # labels may be numbers, which say nothing; names are texts, all different
+    if not (names_of(values) and signals.state_names):
         return table
     rule = "next_states must have the columns of the states, or these with one prefix"
     raise DataError(

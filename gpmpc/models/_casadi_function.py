@@ -15,6 +15,7 @@ from gpmpc.exceptions import ShapeError, UnsupportedModel
 
 _POINTS = 8  # of each range at which a function shows whether it wraps an angle
 _RANGES = ((-1.0, 1.0), (0.1, 2.0))  # roots and logarithms need positive numbers
+_KEPT = 20  # maps over points, of the numbers of points that were asked for last
 _TURN_IS_LOST = 1e-6  # [rad] that a value moves by at most for a turn of its angle
 
 
@@ -71,7 +72,10 @@ class CasadiFunction:
 
     @cached_property
     def jacobian(self) -> "CasadiFunction":
-        """Derivatives of the value, column by column, by all arguments side by side."""
+        """Derivatives of the value, column by column, by all arguments side by side.
+
+        They can be differentiated again, which those of ``_expansion`` cannot.
+        """
         from gpmpc.gp.casadi_ import jacobian_of  # loads CasADi
 
         return CasadiFunction(jacobian_of(self.function))
@@ -203,6 +207,8 @@ class CasadiFunction:
         rows, columns = self.shape
         size = rows * columns
         if K not in self._mapped_expansions:
+            if len(self._mapped_expansions) >= _KEPT:
+                self._mapped_expansions.clear()
             self._mapped_expansions[K] = self._expansion.map(K)
         expansion = self._mapped_expansions[K]
         value, *jacobians = [

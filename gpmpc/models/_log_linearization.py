@@ -280,8 +280,9 @@ def _linear_maps(model: LogModel, m: int, time_step: float) -> _LinearMaps:
     s = c - lagged - pending
     # What is in the queue (pending, input) are entries of (lagged, pending, s, input)
     # themselves: ones select them.
-    queue = np.eye(pending + m, lagged + pending + s + m, k=lagged)
-    queue[pending:] = np.eye(m, c + m, k=c)
+    queue = np.zeros((pending + m, c + m))
+    queue[:pending, lagged : lagged + pending] = np.eye(pending)
+    queue[pending:, c:] = np.eye(m)
     command = queue[:m]
     acting = command
     after = np.zeros((c, c + m))

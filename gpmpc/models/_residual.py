@@ -53,6 +53,7 @@ from gpmpc.models._residual_data import (
     effect_matrix,
     nominal_next_state,
     residual_data,
+    warn_of_remainder,
 )
 from gpmpc.models._tensors import check_like, move
 from gpmpc.signals import UNKNOWN, Signals, check_signals
@@ -232,7 +233,7 @@ class ResidualModel(TensorModel):
         if not isinstance(self.residual, GPPosterior):
             rule = "points can be appended to a residual that is a GPPosterior"
             raise UnsupportedModel(f"{rule}; got {type(self.residual).__name__}")
-        features, targets = residual_data(
+        data = residual_data(
             nominal=self.nominal,
             B=self.B,
             features=self.features,
@@ -240,7 +241,8 @@ class ResidualModel(TensorModel):
             like=self.residual.weights,
         )
         append = append_points if window is None else window.append
-        return replace(self, residual=append(self.residual, features, targets))
+        residual = append(self.residual, data.features, data.targets)
+        return replace(self, residual=residual)
 
     @cached_property
     def features(self) -> Features:
@@ -404,11 +406,13 @@ def train_residual(
     B: Effect | None = None,
     states: Sequence[int] | None = None,
     inputs: Sequence[int] | None = None,
+    further_noise: Tensor | None = None,
 ) -> Training:
     """Trains a residual model, and returns the whole training: it is its ``posterior``.
 
     Arguments and errors are those of ``ResidualModel.train``. Without a nominal model
-    the difference of two states is learned.
+    the difference of two states is learned. ``further_noise`` holds variances (n,) of
+    what no output learns, which are added to the noise of those that do.
     """
     check_transitions(transitions)
     if not hasattr(trainer, "fit"):
@@ -456,6 +460,12 @@ def train_residual(
         angles=features.angles,
         noise=_mean_noise(training.posterior, B, transitions) if callable(B) else None,
         signals=transitions.signals,
+    )
+    if further_noise is not None and bool(further_noise.any()):
+        noise = model.noise_covariance + torch.diag(further_noise)
+        model = replace(model, noise=noise)
+    warn_of_remainder(
+        data.remainder, model.noise_covariance, transitions, features.angles
     )
     return replace(training, posterior=cast(Any, model))
 

@@ -1,5 +1,6 @@
 """Data of a residual GP: the error of a nominal model, as far as B reaches it."""
 
+import logging
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
@@ -16,7 +17,11 @@ from gpmpc._functions import call
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp import Transitions
-from gpmpc.gp._data_checks import RESOLUTION, ColumnDescriptions, signal_names
+from gpmpc.gp._data_checks import (
+    RESOLUTION,
+    ColumnDescriptions,
+    signal_names,
+)
 from gpmpc.models._casadi_function import CasadiFunction
 from gpmpc.models._features import Features
 from gpmpc.models._nominal import Affine, linearize_function
@@ -24,6 +29,7 @@ from gpmpc.models._tensors import check_like
 
 Nominal = Callable[[Tensor, Tensor], Tensor]
 Array = NDArray[np.float64]
+_log = logging.getLogger(__name__)
 Effect = Tensor | Callable[[Tensor], Tensor]
 
 
@@ -94,6 +100,7 @@ class ResidualData(NamedTuple):
 
     features: Tensor  # of states and inputs (N, d)
     targets: Tensor  # the least-squares part of the error of f0 (N, k)
+    remainder: Tensor  # what B does not reach of the error of f0 (N, n)
 
 
 def residual_data(
@@ -133,7 +140,47 @@ def residual_data(
         targets = solutions[..., 0]
     else:
         targets = torch.linalg.solve_triangular(R, Q.mT @ error.mT, upper=True).mT
-    return ResidualData(torch.cat(features(states, inputs), dim=1), targets)
+    reached = (effect @ targets[..., None])[..., 0]
+    return ResidualData(
+        features=torch.cat(features(states, inputs), dim=1),
+        targets=targets,
+        remainder=error - reached,
+    )
+
+
+def warn_of_remainder(
+    remainder: Tensor,
+    noise_covariance: Tensor,
+    transitions: Transitions,
+    angles: Sequence[int],
+) -> None:
+    """Logs states of which much more is missed than a model's noise says.
+
+    Much is a tenth of what a step changes.
+
+    Args:
+        remainder: What B does not reach of the error of f0 (N, n).
+        noise_covariance: Of the model (n, n).
+        transitions: The data.
+        angles: Indices of the states that are angles.
+    """
+    missed = remainder.square().mean(dim=0).sqrt()
+    deviations = noise_covariance.diagonal().sqrt()
+    change = state_difference(transitions.next_states, transitions.states, angles)
+    small = 0.1 * change.square().mean(dim=0).sqrt() + RESOLUTION
+    is_missed = missed > 2.0 * deviations + small
+    if not bool(is_missed.any()):
+        return
+    states, _ = signal_names(transitions)
+    indices = is_missed.nonzero().flatten().tolist()
+    _log.warning(
+        "training: B does not reach all that the nominal model misses: of %s %s remain "
+        "(root mean square), the noise of the model has %s: predictions are too sure "
+        "of them. Give B a column for them, or the model a noise",
+        ", ".join(states[i] for i in indices),
+        ", ".join(f"{float(missed[i]):.2g}" for i in indices),
+        ", ".join(f"{float(deviations[i]):.2g}" for i in indices),
+    )
 
 
 def describe_columns(

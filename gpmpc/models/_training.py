@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import Any, Literal, cast
 
 import numpy as np
-import torch
 
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, ShapeError, check_choice, check_kind
@@ -23,7 +22,7 @@ from gpmpc.models._kinematic_rates import (
     kinematic_residual,
     positions_by_rate,
 )
-from gpmpc.models._residual import ResidualModel, train_residual
+from gpmpc.models._residual import train_residual
 from gpmpc.models._residual_data import Nominal
 from gpmpc.systems import System
 
@@ -157,19 +156,15 @@ def _train_on_system(
             seed=seed,
         )
     kinematic = _kinematics_of(system, transitions, nominal)
-    training = train_residual(
+    return train_residual(
         trainer=trainer,
         transitions=transitions,
         angles=system.angle_indices,
         nominal=kinematic.nominal,
         seed=seed,
         B=kinematic.B,
+        further_noise=kinematic.noise,
     )
-    if not kinematic.noise.any():
-        return training
-    model = cast(ResidualModel, training.posterior)
-    noise = model.noise_covariance + torch.diag(kinematic.noise)
-    return replace(training, posterior=cast(Any, replace(model, noise=noise)))
 
 
 def _nominal_of(system: System) -> Nominal | None:

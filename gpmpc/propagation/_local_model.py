@@ -184,8 +184,9 @@ def _extended_derivatives(
 
 def _congruence(U: Array, X: Array) -> Array:
     """Returns U X U' for each X along the last dimension (*batch, n, n, j)."""
-    *batch, n, j = X.shape
-    return U[..., None, :, :] @ (U @ X.reshape(*batch, n * j)).reshape(X.shape)
+    *leading, n, j = X.shape  # leading: the batch, and n
+    from_left = (U @ X.reshape(*leading, n * j)).reshape(X.shape)
+    return U[..., None, :, :] @ from_left
 
 
 @explains_arguments

@@ -49,7 +49,7 @@ of its own, so that one pass over the sum of all entries gives each entry's.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -157,10 +157,12 @@ def moments(
     return LatentMoments(M=M + model.offset, V=V, J=J)
 
 
-def _output_terms(model: GPPosterior, a: Any, point: _Point) -> _OutputTerms:
-    """Returns z, q, 1/2 log|I + S D|, G and T of the outputs a, at their points."""
+def _output_terms(
+    model: GPPosterior, outputs: slice | list[int], point: _Point
+) -> _OutputTerms:
+    """Returns z, q, 1/2 log|I + S D|, G and T of some outputs, at their points."""
     n = model.state_dim
-    lengthscales = model.lengthscales[a]
+    lengthscales = model.lengthscales[outputs]
     D = lengthscales[:, :n] ** -2
     nu = model.features[:, :n] - point.mu[..., None, :]
     control = model.features[:, n:] - point.u[..., None, :]
@@ -179,7 +181,7 @@ def _output_terms(model: GPPosterior, a: Any, point: _Point) -> _OutputTerms:
     G = inverse * (root[..., None, :] / root[..., :, None])
     return _OutputTerms(
         z=nu * D[:, None, :],
-        q=model.signal_variance[a, None] * (-exponent).exp(),
+        q=model.signal_variance[outputs, None] * (-exponent).exp(),
         half_logdet=factorized.half_logdet,
         G=G,
         T=factorized.T,

@@ -372,10 +372,10 @@ def _with_turns(values: Tensor, centre: Tensor, steps: Tensor, model: Any) -> Te
     deviations = values[..., angles] - centre[..., None, angles]
     states = _states_of_outputs(model)
     if states is None:
-        expected = torch.zeros_like(deviations)
+        expected_deviations = torch.zeros_like(deviations)
     else:
-        expected = steps[..., [states[a] for a in angles]]
-    unexpected = deviations - expected
+        expected_deviations = steps[..., [states[a] for a in angles]]
+    unexpected = deviations - expected_deviations
     is_counted = _spreads_over_a_turn(deviations) & _spreads_over_a_turn(unexpected)
     turns = whole_turns(unexpected).masked_fill(is_counted, 0.0)
     if states is None:

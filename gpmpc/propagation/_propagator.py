@@ -233,7 +233,8 @@ def differentiate(
 def holds_for(propagator: Any, name: str) -> bool:
     """Whether what a class says of its way to propagate holds for a propagator.
 
-    A subclass that propagates in another way inherits what is no longer true.
+    A subclass that propagates in another way inherits what is no longer true: from the
+    class upwards, it counts which comes first, the claim or another ``propagate``.
     """
     if name in getattr(propagator, "__dict__", {}):
         return True
@@ -387,7 +388,7 @@ def _squares_of_units(covariance: np.ndarray) -> np.ndarray:
     largest = np.abs(covariance).max(axis=(-2, -1), initial=precision.tiny)
     round_off = _LAST_PLACES * precision.eps * largest
     variances = np.diagonal(covariance, axis1=-2, axis2=-1)
-    # of which the tolerance's part is the round-off
+    # A variance v is judged by tolerance * v: the v for which that is the round-off.
     return np.maximum(variances, round_off[..., None] / precision.eps**0.5)
 
 

@@ -430,6 +430,10 @@ def test_numbers_that_do_not_go_together_are_refused():
         KernelPosterior.from_gpytorch(
             one_output(10, RBFKernel()), input_dim=1, predicts="delta"
         )
+    with pytest.raises(SettingError, match="signals: must be Signals"):
+        KernelPosterior.from_gpytorch(
+            one_output(10, RBFKernel()), input_dim=1, predicts="value", signals="x"
+        )
 
 
 # --- a forward of its own -------------------------------------------------------------

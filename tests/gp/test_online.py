@@ -278,6 +278,13 @@ def test_refitting_starts_where_the_last_training_ended():
     cold = trainer(data)
     assert len(more.posterior) == 60
     assert (more.objective <= cold.objective + 0.5).all()
+    gp = Trainer(predicts="difference", restarts=0)(data[:20]).posterior
+    leaves = {
+        name: getattr(gp, name).clone().requires_grad_()
+        for name in ("features", "targets", "lengthscales")
+    }
+    followed = trainer.refit(replace(gp, **leaves))
+    np.testing.assert_array_equal(followed.theta, trainer.refit(gp).theta)
 
 
 def test_refitting_keeps_units_and_what_is_predicted():

@@ -206,6 +206,16 @@ def test_a_start_that_is_known_is_searched_from_over_all_points():
     assert np.allclose(again.explored[:, 0], first.objective, rtol=1e-6)
 
 
+def test_an_output_that_stands_still_in_the_subset_is_learned_where_it_moves():
+    """As at a contact; the optimum of the subset is noise, and the search stayed."""
+    x = np.random.default_rng(0).uniform(-1.0, 1.0, (400, 2))
+    y = 20 * np.maximum(0.0, x[:, :1] - 0.97) * (1 + x[:, 1:])
+    rows = torch.from_numpy(x), torch.from_numpy(y), 1
+    everywhere = Trainer(subset=None, predicts="value").fit(*rows)
+    first_a_part = Trainer(subset=30, predicts="value").fit(*rows)
+    assert first_a_part.objective == pytest.approx(everywhere.objective, rel=1e-3)
+
+
 def test_a_subset_comes_first_for_many_points_and_new_starts():
     data = pendulum(40, noise=1e-2)
     whole, same, fewer = (

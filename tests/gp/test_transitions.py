@@ -45,6 +45,7 @@ def test_transitions_keep_their_own_numbers(form):
 def test_features_are_states_and_inputs_and_rows_are_chosen(transitions):
     assert torch.equal(transitions.features[:, 3:], transitions.inputs)
     assert torch.equal(transitions[[4, 1]].next_states, transitions.next_states[[4, 1]])
+    assert torch.equal(transitions[::-2].inputs, transitions.inputs.flip(0)[::2])
     assert (len(transitions[:3]), transitions.state_dim, transitions.input_dim) == (
         3,
         3,

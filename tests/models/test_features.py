@@ -319,6 +319,17 @@ def test_code_without_a_path_that_leads_to_it_is_refused(tmp_path, monkeypatch):
         load_model(tmp_path / "m", trusted=["tests"])
 
 
+def test_maps_over_points_are_kept_for_few_numbers_of_points():
+    x = casadi.MX.sym("x", 1)
+    table = casadi.interpolant("table", "linear", [[0.0, 1.0]], [0.0, 2.0])
+    function = CasadiFunction(casadi.Function("f", [x], [table(x)]))
+    for points in range(1, 30):
+        values, slopes = function.linearize(np.full((points, 1), 0.3))
+        np.testing.assert_allclose(values, 0.6)
+        np.testing.assert_allclose(slopes, 2.0)
+    assert len(function._mapped_expansions) <= 20
+
+
 @pytest.mark.parametrize(
     ("value", "got"),
     [

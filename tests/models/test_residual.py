@@ -206,6 +206,20 @@ def test_training_finds_a_known_residual(trainer):
     )
 
 
+def test_what_the_effect_does_not_reach_is_said(caplog):
+    def train(noise, B=ACTS):
+        ResidualModel.train(
+            AFFINE, transitions(40, noise), B, trainer=Trainer(restarts=0)
+        )
+        return [record.getMessage() for record in caplog.records]
+
+    assert not train(0.0)
+    assert not train(0.1, torch.eye(3))
+    (message,) = train(0.1)
+    assert "of state 1 0.11 remain" in message
+    assert "the noise of the model has 0:" in message
+
+
 def test_by_default_every_state_has_a_residual_of_everything():
     learned = ResidualModel.train(AFFINE, transitions(15), trainer=Trainer(restarts=0))
     assert (
