@@ -306,7 +306,7 @@ class Figures:
     def _model_condition(self, flight: Flight, folder: Path) -> Condition:
         """Returns a flight of the GP itself along the flight that it learned from."""
         row = flight.row
-        last = self.steps + row.horizon
+        final_step = self.steps + row.horizon
         transitions, chosen = self._training_data(flight)
         system = SYSTEMS[flight.subsystem]
         scaling = SCALINGS[flight.subsystem]
@@ -320,8 +320,8 @@ class Figures:
             states.scale(transitions.next_states),
         )
         reference = Reference(
-            states.scale(visited)[: last + 1].numpy(),
-            scaled.inputs[:last].numpy(),
+            states.scale(visited)[: final_step + 1].numpy(),
+            scaled.inputs[:final_step].numpy(),
         )
         return Condition(
             row=row,

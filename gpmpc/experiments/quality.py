@@ -309,7 +309,7 @@ class Quality:
     def document(self, records: Sequence[dict]) -> Document:
         """Returns the table and the figure."""
         rows = self.rows(records)
-        lost = [
+        losses = [
             f"{row['what']} horizon={row['H']}: {row['lost']}"
             for row in rows
             if row["lost"]
@@ -319,7 +319,7 @@ class Quality:
             tables=[_table(rows)],
             data=pd.DataFrame(rows, dtype=object),
             notes=[LEGEND],
-            lists={"Lost": lost},
+            lists={"Lost": losses},
             images={"quality.png": png(front_figure(rows), dpi=130)},
         )
 
@@ -449,20 +449,20 @@ def _row(
 ) -> dict:
     """Returns the row of a case, from records by trajectory."""
     records = _pooled(flights)
-    lost = _first_error(records)
-    if lost is None:
+    reason = _first_error(records)
+    if reason is None:
         error = _first_error(_pooled(truth))
         if error is not None:
-            lost = f"nothing to compare with: NMPC on the true model, {error}"
+            reason = f"nothing to compare with: NMPC on the true model, {error}"
     row = {
         "family": family.name,
         "what": family.words,
         "H": horizon,
-        "lost": lost,
+        "lost": reason,
         "front": False,
         "flights": sum("error" not in record for record in records),
     }
-    if lost is not None:
+    if reason is not None:
         return row
     seconds = [second for record in records for second in record["seconds"]]
     costs = _cost_ratios(flights, truth)

@@ -62,12 +62,12 @@ def front_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
     members.sort(key=lambda case: (case["median"], -case["cost"]))
     _draw_front(axis, members)
     figure.legend(handles=handles, loc="outside upper center", ncols=3, fontsize=8.5)
-    lost = len(rows) - len(cases)
-    if lost:
+    lost_count = len(rows) - len(cases)
+    if lost_count:
         axis.text(
             0.99,
             0.98,
-            f"lost: {lost}",
+            f"lost: {lost_count}",
             transform=axis.transAxes,
             ha="right",
             va="top",

@@ -289,25 +289,25 @@ class SLSQP:
         current = min(starts, key=_rank)
         iterations = 0
         for _ in range(ROUNDS):
-            last = current
-            scaling = _scaling(last)
+            start = current
+            scaling = _scaling(start)
             result = self._round(
-                start=last,
+                start=start,
                 scaling=scaling,
                 lower=lower,
                 upper=upper,
                 request=request,
                 limit=self.iterations - iterations,
             )
-            plan = (last.plan + scaling.T @ result.x).clip(lower, upper)
+            plan = (start.plan + scaling.T @ result.x).clip(lower, upper)
             current = self.evaluate(plan, request)
             iterations += int(result.nit)
-            decrease = abs(last.cost - current.cost)
+            decrease = abs(start.cost - current.cost)
             is_settled = decrease <= self.tolerance**2 * scaling.cost
             if is_settled and self._is_feasible(current, request):
                 return Optimum(current, Status.SOLVED, iterations)
             if iterations >= self.iterations:
-                better = min(current, last, key=_rank)
+                better = min(current, start, key=_rank)
                 return Optimum(better, Status.ITERATION_LIMIT, iterations)
         status = Status.INFEASIBLE
         if self._is_feasible(current, request):

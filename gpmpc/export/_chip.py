@@ -312,13 +312,13 @@ def _flight_header(
         check_kappas(followed)
         inputs = np.zeros((H, m)) if followed.inputs is None else followed.inputs
         rows = parameter_rows(question.parameters, H, count) if count else [[0.0]]
-        parts = [
+        fields = [
             _braces(numbers, followed.states),
             _braces(numbers, inputs),
             str(int(followed.inputs is not None)),
             _braces(numbers, rows),
         ]
-        references.append("{" + ", ".join(parts) + "}")
+        references.append("{" + ", ".join(fields) + "}")
     measured = _braces(numbers, [question.measured for question in questions])
     listed = ",\n".join(references)
     return (

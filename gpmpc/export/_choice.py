@@ -86,13 +86,13 @@ class Budget:
 
     def excesses(self, footprint: Footprint) -> list[str]:
         """Returns what a footprint takes too much of, with its limit, in words."""
-        taken = {
+        demands = {
             "flash": footprint.flash,
             "ram": footprint.memory,
             "instructions": footprint.worst,
         }
         excesses = []
-        for key, amount in taken.items():
+        for key, amount in demands.items():
             limit = getattr(self, key)
             if limit is not None and (amount is None or amount > limit):
                 excesses.append(
@@ -340,11 +340,11 @@ def _ignore(_: str) -> None:
 
 def _check_key(key: str, entry: str, limits: dict[str, float]) -> None:
     """Raises unless an entry names a limit that was not named before."""
-    known = [field.name for field in fields(Budget)]
-    if key not in known:
-        close = difflib.get_close_matches(key, known, n=1, cutoff=0.7)
+    keys = [field.name for field in fields(Budget)]
+    if key not in keys:
+        close = difflib.get_close_matches(key, keys, n=1, cutoff=0.7)
         question = f" (did you mean {close[0]!r}?)" if close else ""
-        rule = f"must limit {' or '.join(known)}, such as {_EXAMPLE}"
+        rule = f"must limit {' or '.join(keys)}, such as {_EXAMPLE}"
         raise SettingError("budget", f"{rule}; got {entry!r}{question}")
     if key in limits:
         raise SettingError("budget", f"{key} stands there twice")

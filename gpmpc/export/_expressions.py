@@ -357,7 +357,7 @@ def graph_of_tape(tape: tapes.Tape) -> tuple[Graph, list[int]]:
     places: dict[int, int] = {}
     value = [graph.constant(0.0)] * tape.size
     for row, constant in zip(tape.code.tolist(), tape.constants, strict=True):
-        operation, target, first, last = row
+        operation, target, first, second = row
         if operation == tapes.OUTPUT:
             value[target] = places[first]
         elif operation == tapes.INPUT:
@@ -365,7 +365,7 @@ def graph_of_tape(tape: tapes.Tape) -> tuple[Graph, list[int]]:
         elif operation == tapes.CONST:
             places[target] = graph.constant(constant)
         elif operation in tapes.TWO_OPERANDS:
-            places[target] = graph.binary(operation, places[first], places[last])
+            places[target] = graph.binary(operation, places[first], places[second])
         else:
             places[target] = graph.unary(operation, places[first])
     return graph, value

@@ -65,9 +65,9 @@ class FilterWriter:
         model: ModelWriter,
     ):
         kalman = estimator.filter
-        parts = []
+        pieces = []
         if kalman.model is controller.prediction.model:
-            parts += [
+            pieces += [
                 "/* the controller's own */",
                 "#define filter_model model",
                 "#define filter_model_variances model_variances",
@@ -83,7 +83,7 @@ class FilterWriter:
         sensor_noise = to_array(measurement.noise_covariance)
         covariance = to_array(belief.covariance)
         angles = list(measurement.angles)
-        parts += [
+        pieces += [
             table("filter_noise", noise, "of the process (n, n)"),
             table("measurement_noise", sensor_noise, "R (p, p)"),
             integers("measured_angles", angles, "entries of y modulo 2 pi"),
@@ -91,7 +91,7 @@ class FilterWriter:
             table("first_covariance", covariance, "(n, n)"),
             _measurement_function(measurement, numbers),
         ]
-        self.text = "\n".join(parts)
+        self.text = "\n".join(pieces)
 
 
 def _tape_of(function: Any) -> Any:

@@ -79,7 +79,7 @@ class ModelWriter:
         m = model.input_dim
         k = model.output_dim
         adds_state = model.predicts == "difference"
-        what = "x + f(x, u)" if adds_state else "f(x, u)"
+        formula = "x + f(x, u)" if adds_state else "f(x, u)"
         d = n + m
         body = [
             f"real query[{d}];",
@@ -96,7 +96,7 @@ class ModelWriter:
                 f"for (i = 0; i < {n} && A; i++)",
                 f"    A[i * {n} + i] += 1;",
             ]
-        self._function(_SIGNATURE.format(name=name), body, f"x+ = {what}, f by GPs")
+        self._function(_SIGNATURE.format(name=name), body, f"x+ = {formula}, f by GPs")
         self._write_variances(name, table)
         self._write_covariance(name, _diagonal_variance(k))
 
@@ -115,7 +115,7 @@ class ModelWriter:
         features = to_array(gp.features)
         lengthscales = to_array(gp.lengthscales)
         table = partial(Numbers("double").table, kind="wide")
-        parts = [
+        lines = [
             f"/* GPs {prefix}: k = {k} outputs over N = {size} points of {d} features",
             "",
             "   m_a(x~) = offset_a + sum_i beta_ai k_a(x~_i, x~)",
@@ -138,18 +138,18 @@ class ModelWriter:
             rows, columns = np.tril_indices(size)
             factors = to_array(gp.cholesky)[:, rows, columns]
             comment = "K + sn2 I = L L': lower triangles, row after row"
-            parts.append(table(cholesky, factors, comment))
+            lines.append(table(cholesky, factors, comment))
         fixed = ""
         if self._numbers.precision == "float":
-            parts.append(fixed_tables(gp, prefix))
+            lines.append(fixed_tables(gp, prefix))
             fixed = f", &{prefix}_fixed"
-        parts.append(
+        lines.append(
             f"static const gp_tables {prefix} = {{\n"
             f"    {size}, {d}, {k}, {prefix}_points, {prefix}_scales,\n"
             f"    {prefix}_log_signal, {prefix}_signal, {prefix}_weights,\n"
             f"    {prefix}_offset, {cholesky}{fixed}}};\n"
         )
-        self._parts.append("\n".join(parts))
+        self._parts.append("\n".join(lines))
         return prefix
 
     def _reserve(self, points: int, features: int, outputs: int) -> None:
@@ -322,12 +322,12 @@ class ModelWriter:
             f"              + (i < {p} ? next[i] : 0);",
             *_wrapped_slope_lines(n, m, p, name),
         ]
-        what = "z+ = [f(x, Z z + W u); 0] + L z + M u"
+        formula = "z+ = [f(x, Z z + W u); 0] + L z + M u"
         if isinstance(model, DelayedModel):
-            what += f": inputs act {model.delay:g} steps late"
+            formula += f": inputs act {model.delay:g} steps late"
         elif isinstance(model, DisturbedModel):
-            what += ": disturbances are states"
-        self._function(_SIGNATURE.format(name=name), body, what)
+            formula += ": disturbances are states"
+        self._function(_SIGNATURE.format(name=name), body, formula)
         if self.variances:
             line = f"#define {name}_variances {inner}_variances\n"
             self._parts.append(line)

@@ -81,9 +81,9 @@ def flight_of(fly: Fly, controller: GPMPC) -> Flight:
     steps = len(rollout.inputs)
     if not 0 < steps <= len(witness.questions):
         rule = "must fly the controller that it is handed"
-        asked = len(witness.questions)
+        count = len(witness.questions)
         raise SettingError(
-            "fly", f"{rule}; it was asked {asked} times in {steps} steps"
+            "fly", f"{rule}; it was asked {count} times in {steps} steps"
         )
     # a rehearsal asks before the first step
     questions = witness.questions[-steps:]

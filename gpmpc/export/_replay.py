@@ -117,7 +117,7 @@ def _numbers_of(answer: Answer, horizon: int, parameters: int) -> list[np.ndarra
     if inputs is None:
         inputs = np.zeros((horizon, len(answer.input)))
     rows = parameter_rows(question.parameters, horizon, parameters)
-    parts = (
+    arrays = (
         question.measured,
         followed.states,
         has_inputs,
@@ -125,4 +125,4 @@ def _numbers_of(answer: Answer, horizon: int, parameters: int) -> list[np.ndarra
         rows,
         answer.input,
     )
-    return [np.ravel(np.asarray(part, dtype=float)) for part in parts]
+    return [np.ravel(np.asarray(array, dtype=float)) for array in arrays]

@@ -111,11 +111,11 @@ def needed_parts(text: str, flags: Mapping[str, int]) -> str:
     # by open condition: whether it is decided here, and whether its lines are needed
     conditions: list[tuple[bool, bool]] = []
     for line in text.splitlines():
-        words = line.split()
-        directive = words[0] if words else ""
+        tokens = line.split()
+        directive = tokens[0] if tokens else ""
         decided, needed = conditions[-1] if conditions else (False, True)
         if directive in ("#if", "#ifdef", "#ifndef"):
-            alternatives = " ".join(words[1:]).split(" || ")
+            alternatives = " ".join(tokens[1:]).split(" || ")
             is_decided = directive == "#if" and all(
                 name.lstrip("!") in flags for name in alternatives
             )

@@ -224,7 +224,7 @@ def _texts(
         tables(controller, numbers),
         functions.text,
     ]
-    parts = {
+    texts = {
         "model": "\n".join(generated),
         "pairs": _part("pairs.c"),
         "exact": _part("exact.c"),
@@ -233,7 +233,7 @@ def _texts(
     }
     names = [*_names(controller, estimator), *notes]
     header = _header(settings, numbers, names)
-    source = needed_parts(_source(parts, names), settings.flags)
+    source = needed_parts(_source(texts, names), settings.flags)
     # of both: header and source of two exports do not go together
     export = f"0x{zlib.crc32((header + source).encode()):08x}ul"
     return header.replace("{export}", export), source.replace("{export}", export)

@@ -153,8 +153,8 @@ class Correction:
         after = np.clip(np.searchsorted(knots, ahead), 1, len(knots) - 1)
         low = np.array(knots)[after - 1]
         high = np.array(knots)[after]
-        share = np.clip((ahead - low) / (high - low), 0, 1)[:, None]
-        between = (1 - share) * values[:, after - 1] + share * values[:, after]
+        fraction = np.clip((ahead - low) / (high - low), 0, 1)[:, None]
+        between = (1 - fraction) * values[:, after - 1] + fraction * values[:, after]
         return windows.space.displace(predicted, between)
 
     def _at(self, i: int, windows: Windows, predicted: Array) -> Array:
@@ -267,17 +267,19 @@ def _regressors(
     that is predicted. A step that is too near for as many means has zeros for the
     others.
     """
-    past = windows.past
+    start_row = windows.past
     inputs = windows.inputs
-    start = windows.states[:, past]
-    columns = [kinematics.features(start, inputs[:, past], windows.context[:, past])]
+    start = windows.states[:, start_row]
+    columns = [
+        kinematics.features(start, inputs[:, start_row], windows.context[:, start_row])
+    ]
     for rows in ROWS_SEEN:
-        earlier = windows.states[:, past - rows]
+        earlier = windows.states[:, start_row - rows]
         columns.append(windows.space.difference(start, earlier))
     for rows in ROWS_SEEN:
-        columns.append(inputs[:, past - rows])
+        columns.append(inputs[:, start_row - rows])
     for rows in np.array_split(np.arange(step), min(BINS, step)) if step else ():
-        columns.append(inputs[:, past + rows].mean(axis=1))
+        columns.append(inputs[:, start_row + rows].mean(axis=1))
     missing = max(BINS - step, 0) * inputs.shape[-1]
     columns.append(np.zeros((len(windows), missing)))
     columns.append(windows.space.difference(predicted, start))

@@ -113,8 +113,8 @@ def _integrating_model(
     for rate, position, c, *_ in integrals:
         A[position] += h * A[rate] * c
         A[position, rate] += h * (1 - c)
-    rest = Affine.identity(n, inputs.shape[1])
-    return Affine(A=A, B=rest.B, c=rest.c)
+    identity = Affine.identity(n, inputs.shape[1])
+    return Affine(A=A, B=identity.B, c=identity.c)
 
 
 def _effect_of_learned(

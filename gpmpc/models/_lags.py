@@ -72,8 +72,8 @@ class Lags:
         if self.inputs:
             second_input = first_input + m
             B[first_input:second_input] = torch.eye(m)
-            kept = torch.eye(self.dim - second_input)
-            A[second_input:, first_input : self.dim - m] = kept
+            shift = torch.eye(self.dim - second_input)
+            A[second_input:, first_input : self.dim - m] = shift
         return Affine(A, B, torch.zeros(self.dim, dtype=torch.float64))
 
     @cached_property

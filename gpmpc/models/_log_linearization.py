@@ -49,12 +49,12 @@ class LogLinearizer:
         """
         n = self._n
         maps = self._maps
-        parts = self._model.parts(states, self._m)
+        state_parts = self._model.parts(states, self._m)
         carried = states[:, n:]
         acting = carried @ maps.acting_by_carried.T + inputs @ maps.acting_by_input.T
-        x = parts.states
+        x = state_parts.states
         local = self._differentiate(x, acting)
-        outputs = self._outputs(local, parts.memory, covariance)
+        outputs = self._outputs(local, state_parts.memory, covariance)
         after = self._model.kinematics.step(x, outputs.mean, self._time_step)
         carried_after = (
             carried @ maps.carried_by_carried.T
@@ -389,6 +389,6 @@ def _gp_prediction(
     gp: OutputGP, features: Array, regressors: Array, covariance: bool
 ) -> Linearized:
     """Linearises a GP by what it sees."""
-    seen = regressors[:, :-1] if gp.sees_memory else features
-    no_inputs = np.empty((len(seen), 0))
-    return gp.posterior.linearize(np.ascontiguousarray(seen), no_inputs, covariance)
+    points = regressors[:, :-1] if gp.sees_memory else features
+    no_inputs = np.empty((len(points), 0))
+    return gp.posterior.linearize(np.ascontiguousarray(points), no_inputs, covariance)

@@ -336,18 +336,18 @@ class LogModel:
     ) -> "_ActingState":
         """Returns the inputs that act in a step, beside the parts of a state."""
         m = inputs.shape[-1]
-        parts = self.parts(carried, m)
+        state_parts = self.parts(carried, m)
         inputs = _over_batch(inputs, carried.shape[:-1])
-        queue = np.concatenate([parts.pending, inputs], axis=-1)
+        queue = np.concatenate([state_parts.pending, inputs], axis=-1)
         acting = queue[..., :m]
-        lagged = parts.lagged
+        lagged = state_parts.lagged
         if len(self.time_constants):
             lags = self.lags(time_step, time_constants)
-            lagged = lags.after(parts.lagged, acting)
-            acting = lags.acting(parts.lagged, acting)
+            lagged = lags.after(state_parts.lagged, acting)
+            acting = lags.acting(state_parts.lagged, acting)
         return _ActingState(
-            states=parts.states,
-            memory=parts.memory,
+            states=state_parts.states,
+            memory=state_parts.memory,
             inputs=acting,
             next_lagged=lagged,
             next_pending=queue[..., m:],
@@ -373,8 +373,8 @@ class LogModel:
         memory = now.memory
         if not self.memory.empty:
             memory = self.memory.step(memory, features, beyond_nominal)
-        parts = [after, now.next_lagged, now.next_pending, memory]
-        return np.concatenate(parts, axis=-1)
+        next_parts = [after, now.next_lagged, now.next_pending, memory]
+        return np.concatenate(next_parts, axis=-1)
 
     def lags(self, time_step: float, time_constants: Any = None) -> FirstOrderLags:
         """Returns the first-order lags, discretised.
@@ -499,9 +499,9 @@ class LogModel:
         if not self.memory.empty:
             memory = self._remembered(windows, rows)
         batch = lagged.shape[:-1]
-        parts = (states, lagged, pending, memory)
-        parts = [np.broadcast_to(part, (*batch, part.shape[-1])) for part in parts]
-        return np.concatenate(parts, axis=-1)
+        arrays = (states, lagged, pending, memory)
+        arrays = [np.broadcast_to(array, (*batch, array.shape[-1])) for array in arrays]
+        return np.concatenate(arrays, axis=-1)
 
     def _remembered(self, windows: Windows, rows: slice) -> Array:
         """Returns what is remembered at the starts of windows (W, s)."""

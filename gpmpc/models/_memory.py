@@ -177,15 +177,15 @@ class Memory:
             What is remembered at the row after them (..., s).
         """
         P = features.shape[-2]
-        parts = []
+        columns = []
         for row in range(1, self.rows + 1):
-            parts.append(features[..., max(P - row, 0), :])
+            columns.append(features[..., max(P - row, 0), :])
         for decay in self.decays:
-            parts.append(_exponential_mean(features, decay))
+            columns.append(_exponential_mean(features, decay))
         for decay in self.output_decays:
-            parts.append(_exponential_mean(outputs, decay))
+            columns.append(_exponential_mean(outputs, decay))
         batch = features.shape[:-2]
-        return np.concatenate(parts or [np.empty((*batch, 0))], axis=-1)
+        return np.concatenate(columns or [np.empty((*batch, 0))], axis=-1)
 
     def step(self, memory: Array, features: Array, outputs: Array) -> Array:
         """Returns what is remembered a row later (..., s).
@@ -198,21 +198,21 @@ class Memory:
         d = features.shape[-1]
         o = outputs.shape[-1]
         end = 0
-        parts = []
+        columns = []
         if self.rows:
             end = self.rows * d
-            parts += [features, memory[..., : end - d]]
+            columns += [features, memory[..., : end - d]]
         for decay in self.decays:
             mean = memory[..., end : end + d]
-            parts.append(decay * mean + (1 - decay) * features)
+            columns.append(decay * mean + (1 - decay) * features)
             end += d
         for decay in self.output_decays:
             mean = memory[..., end : end + o]
-            parts.append(decay * mean + (1 - decay) * outputs)
+            columns.append(decay * mean + (1 - decay) * outputs)
             end += o
-        if not parts:
+        if not columns:
             return memory
-        return np.concatenate(parts, axis=-1)
+        return np.concatenate(columns, axis=-1)
 
     def regressors(self, features: Array, memory: Array) -> Array:
         """Returns the regressors (..., r) of a linear term.

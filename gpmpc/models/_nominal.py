@@ -215,7 +215,7 @@ def linearize_function(
         # of two it fails.
         pairs = [np.repeat(argument, 2, axis=0) for argument in arguments]
         doubled = linearize_function(function, model, *pairs)
-        return tuple(part[:1] for part in doubled)
+        return tuple(array[:1] for array in doubled)
     shapes: list[torch.Size] = []
 
     def flat_function(*points: Tensor) -> tuple[Tensor]:
@@ -226,6 +226,6 @@ def linearize_function(
     tensors = tensors_for(model, *arguments)
     (value,), jacobians = batched_jacobian(flat_function, tensors)
     shape = shapes[0]
-    parts = [value.unflatten(1, shape)]
-    parts += [jacobian.unflatten(1, shape) for jacobian in jacobians]
-    return tuple(to_array(part) for part in parts)
+    arrays = [value.unflatten(1, shape)]
+    arrays += [jacobian.unflatten(1, shape) for jacobian in jacobians]
+    return tuple(to_array(array) for array in arrays)

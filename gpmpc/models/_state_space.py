@@ -91,22 +91,22 @@ class StateSpace:
 
     def difference(self, a: Array, b: Array) -> Array:
         """Computes a - b (..., e) of states (..., n)."""
-        parts = []
+        differences = []
         for group, columns in zip(self.groups, self.columns, strict=True):
             a_part = a[..., columns]
             b_part = b[..., columns]
             if group.kind == "quaternion":
                 turn = quaternion_product(quaternion_inverse(b_part), a_part)
-                parts.append(rotation_vector(turn))
+                differences.append(rotation_vector(turn))
             elif group.kind == "angle":
-                parts.append(wrap(a_part - b_part))
+                differences.append(wrap(a_part - b_part))
             else:
-                parts.append(a_part - b_part)
-        return np.concatenate(parts, axis=-1)
+                differences.append(a_part - b_part)
+        return np.concatenate(differences, axis=-1)
 
     def displace(self, state: Array, error: Array) -> Array:
         """Computes the state (..., n) that lies an error (..., e) off another."""
-        parts = []
+        displaced = []
         columns = zip(self.columns, self.error_columns, strict=True)
         for group, (state_columns, error_columns) in zip(
             self.groups, columns, strict=True
@@ -115,12 +115,12 @@ class StateSpace:
             error_part = error[..., error_columns]
             if group.kind == "quaternion":
                 turn = rotation_quaternion(error_part)
-                parts.append(quaternion_product(state_part, turn))
+                displaced.append(quaternion_product(state_part, turn))
             elif group.kind == "angle":
-                parts.append(wrap(state_part + error_part))
+                displaced.append(wrap(state_part + error_part))
             else:
-                parts.append(state_part + error_part)
-        return np.concatenate(parts, axis=-1)
+                displaced.append(state_part + error_part)
+        return np.concatenate(displaced, axis=-1)
 
     def distances(self, errors: Array) -> Array:
         """Computes each group's Euclidean or geodesic error (..., groups).

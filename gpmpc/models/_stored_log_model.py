@@ -136,8 +136,12 @@ def _noise_rows(header: Mapping[str, Any]) -> tuple[float, ...]:
 
 def _regressions(model: LogModel) -> dict[str, Correction | StartFilter]:
     """Returns the regressions on the past that a model has, by name."""
-    parts = {"correction": model.correction, "start_filter": model.start_filter}
-    return {name: part for name, part in parts.items() if part is not None}
+    regressions = {"correction": model.correction, "start_filter": model.start_filter}
+    return {
+        name: regression
+        for name, regression in regressions.items()
+        if regression is not None
+    }
 
 
 def _nominal_header(nominal: Any) -> list[Any]:
@@ -384,8 +388,8 @@ def _kinematics(name: str, space: StateSpace) -> Kinematics:
     if name == _INCREMENTS:
         return Increments(space)
     if name != _RIGID_BODY:
-        known = f"{_INCREMENTS}, {_RIGID_BODY}"
-        raise DataError(f"unknown kinematics {name!r:.80}; known are {known}")
+        names = f"{_INCREMENTS}, {_RIGID_BODY}"
+        raise DataError(f"unknown kinematics {name!r:.80}; known are {names}")
     groups = [(group.kind, len(group.entries)) for group in space.groups]
     vector = ("vector", 3)
     if groups != [vector, ("quaternion", 4), vector, vector]:

@@ -18,16 +18,16 @@ def move(model: Any, device: Any = None, dtype: torch.dtype | None = None) -> An
         UnsupportedModel: A part is a model that exists in float64 on the host alone.
     """
     check_destination(device, dtype)
-    parts = {field.name: getattr(model, field.name) for field in fields(model)}
-    for name, part in parts.items():
-        if isinstance(part, Tensor) or hasattr(part, "state_dim"):
-            if not hasattr(part, "to"):
-                kind = type(part).__name__
+    values = {field.name: getattr(model, field.name) for field in fields(model)}
+    for name, value in values.items():
+        if isinstance(value, Tensor) or hasattr(value, "state_dim"):
+            if not hasattr(value, "to"):
+                kind = type(value).__name__
                 raise UnsupportedModel(f"{kind} has no to(): it cannot be moved")
-            parts[name] = part.to(device=device, dtype=dtype)
-        elif isinstance(part, Affine):
-            parts[name] = move(part, device, dtype)
-    return type(model)(**parts)
+            values[name] = value.to(device=device, dtype=dtype)
+        elif isinstance(value, Affine):
+            values[name] = move(value, device, dtype)
+    return type(model)(**values)
 
 
 def check_like(name: str, part: Any, whole: Any, owner: str = "the model") -> None:

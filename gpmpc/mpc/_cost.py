@@ -152,10 +152,10 @@ class Tracking:
             SettingError: Deviations are weighed, and no reference inputs were handed
                 over.
         """
-        parts = self.paid_parts(
+        cost_parts = self.paid_parts(
             states, inputs, references, previous_input, reference_inputs
         )
-        return parts.states + parts.inputs
+        return cost_parts.states + cost_parts.inputs
 
     def paid_parts(
         self,

@@ -164,14 +164,14 @@ class Foresight:
         """
         if len(costs) < self._holding_stages:
             return False
-        last = costs[-self._holding_stages :]
-        if not last.are_finite.all():
+        final_costs = costs[-self._holding_stages :]
+        if not final_costs.are_finite.all():
             return False
         limit = _NEAR_GOAL * max(dearest, costs.dearest)
-        if (last.weighed <= max(limit, self._negligible)).all():
+        if (final_costs.weighed <= max(limit, self._negligible)).all():
             return True
-        is_there = (last.errors <= _NEAR_GOAL * last.weighed).all()
-        return bool(is_there) and _stand(last.weighed)
+        is_there = (final_costs.errors <= _NEAR_GOAL * final_costs.weighed).all()
+        return bool(is_there) and _stand(final_costs.weighed)
 
     def fly(
         self, beginning: Trajectory, question: Question, limit: float = np.inf
@@ -217,8 +217,8 @@ class Foresight:
 
         They are as many as the goal is to be held for.
         """
-        last = costs[-self._holding_stages :]
-        return _stand(last.weighed) and _stand(last.violations)
+        final_costs = costs[-self._holding_stages :]
+        return _stand(final_costs.weighed) and _stand(final_costs.violations)
 
     def step(self, state: Array, input: Array, question: Question) -> Array:
         """Returns the next state (n,) of the model."""
@@ -366,7 +366,7 @@ class Foresight:
         whole = question.over(length)
         targets = np.asarray(whole.reference.states)
         state = flight.states[0]
-        last = no_plan(
+        previous = no_plan(
             question.previous_input, len(state), length, question.disturbance
         )
         angles = controller.prediction.problem.cost.angle_indices
@@ -375,7 +375,7 @@ class Foresight:
             plan = controller.control(
                 whole.belief(state),
                 replace(whole.reference, states=targets + turns),
-                last,
+                previous,
                 whole.parameters,
                 plan=(flight.inputs, flight.states),
             )

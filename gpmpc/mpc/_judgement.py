@@ -84,16 +84,16 @@ class FlightJudgement(NamedTuple):
         """The judgement of a flight by those of its steps."""
         levels = [judgement.level for judgement in steps]
         suspicious = levels.count("suspicious")
-        lost = levels.count("lost")
+        lost_steps = levels.count("lost")
         if not steps:
             return cls()
-        if lost:
+        if lost_steps:
             first = levels.index("lost")
             reason = steps[first].reason
             if levels[-1] != "lost":
-                last = len(levels) - 1 - levels[::-1].index("lost")
-                reason += f"; back from step {last + 1} on"
-            return cls("lost", reason, first, suspicious, lost)
+                last_lost = len(levels) - 1 - levels[::-1].index("lost")
+                reason += f"; back from step {last_lost + 1} on"
+            return cls("lost", reason, first, suspicious, lost_steps)
         if levels[-1] == "healthy":
             return cls(suspicious=suspicious)
         first = len(levels)
@@ -288,14 +288,14 @@ class FlightJudge:
         alarm = self._memory.flight[0]
         reason = int(alarm["reason"])
         value = float(alarm["value"])
-        words = _WORDS[reason]
+        sentence = _WORDS[reason]
         if reason == checks.CLIMBING and value < 1.0:
-            words = _CLIMBING_BELOW_THE_FIRST
+            sentence = _CLIMBING_BELOW_THE_FIRST
         if reason in (checks.AWAY, checks.RISING):
-            return Judgement("lost", words.format(value=value))
+            return Judgement("lost", sentence.format(value=value))
         names = self._inputs if reason == checks.SATURATED else self._states
         name = names[alarm["entry"]]
-        return Judgement("suspicious", words.format(name=name, value=value))
+        return Judgement("suspicious", sentence.format(name=name, value=value))
 
 
 def _learned_noise(controller: Any) -> Array | None:

@@ -105,13 +105,15 @@ class LinearLoop:
         if np.abs(np.linalg.eigvals(loop)).max() <= limit:
             return False
         _, (scales, _) = matrix_balance(loop, permute=False, separate=True)
-        values, left, right = eig(loop, left=True)
-        left = left * scales[:, None]
-        right = right / scales[:, None]
-        left = left / np.linalg.norm(left, axis=0)
-        right = right / np.linalg.norm(right, axis=0)
+        values, left_vectors, right_vectors = eig(loop, left=True)
+        left_vectors = left_vectors * scales[:, None]
+        right_vectors = right_vectors / scales[:, None]
+        left_vectors = left_vectors / np.linalg.norm(left_vectors, axis=0)
+        right_vectors = right_vectors / np.linalg.norm(right_vectors, axis=0)
         for i in np.flatnonzero(np.abs(values) > limit):
-            doubt = self._doubt(values[i], left[:, i], right[:, i], scales)
+            doubt = self._doubt(
+                values[i], left_vectors[:, i], right_vectors[:, i], scales
+            )
             if abs(values[i]) > limit + _DEVIATIONS * doubt:
                 return True
         return False

@@ -151,10 +151,10 @@ def _control(
     try:
         return controller.control(belief, reference, previous, **options)
     except TypeError as error:
-        known = signature(controller.control).parameters
-        takes_all = any(p.kind is Parameter.VAR_KEYWORD for p in known.values())
+        accepted = signature(controller.control).parameters
+        takes_all = any(p.kind is Parameter.VAR_KEYWORD for p in accepted.values())
         for key in options:
-            if key not in known and not takes_all:
+            if key not in accepted and not takes_all:
                 rule = f"is nothing that {type(controller).__name__}.control takes"
                 raise SettingError(key, rule) from error
         raise

@@ -51,9 +51,11 @@ def rest_points(
     inputs = _reference_inputs(reference, (len(states), prediction.problem.input_dim))
     steps = np.zeros_like(states)  # of the reference; none at its end
     steps[:-1] = state_difference(states[1:], states[:-1], prediction.angles)
-    last = len(states) - 1
+    final_row = len(states) - 1
     n = states.shape[1]
-    chosen = np.unique(np.linspace(0, max(last - 1, 0), _POINTS).round().astype(int))
+    chosen = np.unique(
+        np.linspace(0, max(final_row - 1, 0), _POINTS).round().astype(int)
+    )
     rows = np.hstack([states, steps, inputs])[chosen]
     points = []
     for row in np.unique(rows, axis=0):
@@ -187,8 +189,10 @@ class _RestSearch:
         lower, upper = prediction.problem.inputs.first
         input_ranges = upper - lower
         if np.isfinite(input_ranges).all():
-            reach = _reach(start.A, start.B, input_ranges, prediction.horizon)
-            state_ranges = _ranges_by_effect(start.A, reach, prediction.horizon)
+            reachable = _reachable_ranges(
+                start.A, start.B, input_ranges, prediction.horizon
+            )
+            state_ranges = _ranges_by_effect(start.A, reachable, prediction.horizon)
         else:
             state_ranges = np.ones(len(start.A))
         scales = data_scales(prediction.model)
@@ -242,37 +246,37 @@ class _RestSearch:
         )
 
 
-def _reach(A: Array, B: Array, input_ranges: Array, horizon: int) -> Array:
+def _reachable_ranges(A: Array, B: Array, input_ranges: Array, horizon: int) -> Array:
     """Returns how far inputs within their ranges (m,) move states (n,), 1 at most."""
     effect = B
-    reach = np.abs(effect) @ input_ranges
+    reachable = np.abs(effect) @ input_ranges
     for _ in range(horizon - 1):
-        if (reach >= 1.0).all():
+        if (reachable >= 1.0).all():
             break
         effect = A @ effect
-        reach = np.minimum(1.0, reach + np.abs(effect) @ input_ranges)
-    return reach
+        reachable = np.minimum(1.0, reachable + np.abs(effect) @ input_ranges)
+    return reachable
 
 
-def _ranges_by_effect(A: Array, reach: Array, horizon: int) -> Array:
+def _ranges_by_effect(A: Array, reachable: Array, horizon: int) -> Array:
     """Returns the ranges of states (n,), also of those that no input reaches.
 
     Such a one is as large as it takes to move one that an input reaches by its range
     within a horizon, 1 at most; 0 where it moves none.
     """
-    is_reached = reach > 0.0
+    is_reached = reachable > 0.0
     if is_reached.all():
-        return reach
+        return reachable
     power = A
     effects = np.abs(A)  # largest ones so far
     for _ in range(horizon - 1):
         power = A @ power
         effects = np.maximum(effects, np.abs(power))
     with np.errstate(divide="ignore"):
-        sizes = reach[is_reached, None] / effects[is_reached]
+        sizes = reachable[is_reached, None] / effects[is_reached]
     least = sizes.min(axis=0, initial=np.inf)
     own_ranges = np.where(np.isfinite(least), np.minimum(1.0, least), 0.0)
-    return np.where(is_reached, reach, own_ranges)
+    return np.where(is_reached, reachable, own_ranges)
 
 
 def _cost_at(

@@ -226,7 +226,7 @@ def _roll_out_belief(
     states = target.states.copy()
     inputs = target.inputs.copy()
     covariances = target.covariances.copy()
-    parts = []
+    linearizations = []
     for k in range(prediction.horizon):
         off = states[k, :n] - target.states[k, :n]
         input = target.inputs[k] + F[k] @ off
@@ -244,8 +244,8 @@ def _roll_out_belief(
         states[k + 1] = stage.next[0]
         _, after = linearizer.moments(stage.next, covariances[k + 1 : k + 2])
         covariances[k + 1] = after[0]
-        parts.append(stage)
-    stages = Stages._make(map(np.concatenate, zip(*parts, strict=True)))
+        linearizations.append(stage)
+    stages = Stages._make(map(np.concatenate, zip(*linearizations, strict=True)))
     return prediction.assemble(Plan(states, inputs, covariances), stages, request)
 
 

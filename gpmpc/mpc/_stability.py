@@ -90,22 +90,24 @@ class Stability:
     def warnings(self) -> list[str]:
         """What to change, a line each; none where nothing is."""
         if self.safe_disturbance_gain < self.disturbance_gain:
-            what = f"disturbance_gain {self.disturbance_gain:g} is too large"
+            fault = f"disturbance_gain {self.disturbance_gain:g} is too large"
             if self.disturbance_gain == 1.0:
-                what = f"{what} (form 'velocity' has it, too)"
-            why = "the loop swings up where inputs do 0.7 or 1.3 of what the model says"
-            return [f"{what}: {why}; {self.safe_disturbance_gain:.2g} is safe"]
+                fault = f"{fault} (form 'velocity' has it, too)"
+            cause = (
+                "the loop swings up where inputs do 0.7 or 1.3 of what the model says"
+            )
+            return [f"{fault}: {cause}; {self.safe_disturbance_gain:.2g} is safe"]
         if self.stable or not self.judged:
             return []
         growth = 100.0 * (self.spectral_radius - 1.0)
-        what = f"horizon {self.horizon}: the loop runs away from its reference"
+        fault = f"horizon {self.horizon}: the loop runs away from its reference"
         if self.shortest_horizon is not None:
             cure = f"it settles with {self.shortest_horizon} steps or more"
         elif self.horizons:
             cure = f"so it does with any up to {self.horizons}: change the weights"
         else:
             cure = "try a longer one"
-        return [f"{what}, by {growth:.2g} % a step; {cure}"]
+        return [f"{fault}, by {growth:.2g} % a step; {cure}"]
 
 
 def stability(

@@ -433,11 +433,11 @@ class ManyStarts:
         """
         belief, reference, previous, parameters = arguments
         deadline = self._deadline()
-        last = _without_solution(previous)
-        best = self.controller.control(belief, reference, last, parameters)
+        last_plan = _without_solution(previous)
+        best = self.controller.control(belief, reference, last_plan, parameters)
         goal = self._nearest_turn(reference, best.means[-1])
-        lowest = self._judge(best, goal, last, parameters)
-        for decision, value in self.plans(belief, reference, last, parameters):
+        lowest = self._judge(best, goal, last_plan, parameters)
+        for decision, value in self.plans(belief, reference, last_plan, parameters):
             # Among plans beyond a hard bound, whose cost is infinite, the first one.
             is_first = decision.applicable and not best.applicable
             if is_first or value < lowest:
@@ -632,12 +632,12 @@ class ManyStarts:
         That is from its last plan, without one, and with shorter horizons.
         """
         previous = arguments.previous
-        here = arguments.state[None]
+        present = arguments.state[None]
         nothing = np.empty((0, self.problem.input_dim))
         if previous is not None and self._can_continue(previous):
-            yield Trajectory(self.controller, here, nothing, previous)
+            yield Trajectory(self.controller, present, nothing, previous)
         for controller in (self.controller, *self._foresight.shorter):
-            yield Trajectory(controller, here, nothing)
+            yield Trajectory(controller, present, nothing)
 
     def _beginnings(
         self, arguments: _StepArguments, question: Question
@@ -645,10 +645,10 @@ class ManyStarts:
         """Makes states and inputs of the plans of all starts, and of relays."""
         foresight = self._foresight
         state = arguments.state
-        last = _without_solution(arguments.previous)
+        last_plan = _without_solution(arguments.previous)
         different: list[Array] = []
         for decision, _ in self.plans(
-            arguments.belief, question.reference, last, question.parameters
+            arguments.belief, question.reference, last_plan, question.parameters
         ):
             inputs = decision.inputs
             states = decision.means

@@ -436,16 +436,16 @@ class Problem:
         value = getattr(self, key)
         if value is None:
             return ()
-        parts = (value,)
+        values = (value,)
         if isinstance(value, Iterable) and not isinstance(value, str | Mapping):
-            parts = tuple(value)
-        for part in parts:
-            check_kind(key, part, kind, examples)
-            size = getattr(part, "size", None)
+            values = tuple(value)
+        for each in values:
+            check_kind(key, each, kind, examples)
+            size = getattr(each, "size", None)
             if size not in (None, self.state_dim):
                 rule = f"must bound {self.state_dim} states"
                 raise SettingError(key, f"{rule}; got {size}")
-        return parts
+        return values
 
     @property
     def state_dim(self) -> int:

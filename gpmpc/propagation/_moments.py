@@ -204,9 +204,9 @@ def _covariances(model: GPPosterior, pairs: _Pairs, point: _Point) -> Tensor:
     delta = of_a.z @ T @ of_b.z.mT + (delta_i[..., :, None] + delta_j[..., None, :])
     centred = torch.expm1(delta.clamp_max(_LARGEST_DELTA[delta.dtype]))
     if not pairs.same:
-        left = (model.weights[a] * of_a.q)[..., None, :]
+        weighted = (model.weights[a] * of_a.q)[..., None, :]
         right = (model.weights[b] * of_b.q)[..., None]
-        return (left @ centred @ right)[..., 0, 0]
+        return (weighted @ centred @ right)[..., 0, 0]
     E = model.weights[a, :, None] * model.weights[a, None, :] - model.precision[a]
     V = (of_a.q[..., None, :] @ (E * centred) @ of_a.q[..., None])[..., 0, 0]
     return V + model.signal_variance[a] - model.variance_reduction(of_a.q, a)

@@ -253,13 +253,13 @@ def _check_single_point(
     model: DynamicsModel, points: _Points, linearized: Linearized
 ) -> None:
     """Compares the linearisation at the second point alone with that among others."""
-    alone = model.linearize(
+    single = model.linearize(
         _to_numpy(points.states)[1:2], _to_numpy(points.inputs)[1:2]
     )
     for name in Linearized._fields:
         require_close(
             f"linearize: K points are the loop over them ({name})",
-            torch.from_numpy(getattr(alone, name)[0]),
+            torch.from_numpy(getattr(single, name)[0]),
             torch.from_numpy(getattr(linearized, name)[1]),
             points.exact,
         )

@@ -282,28 +282,28 @@ def _check_without_covariance(case: _Case) -> None:
         belief = Gaussian(case.belief.mean, scale * case.belief.covariance)
         return _parts(case.propagate(belief))
 
-    certain = parts(0.0)
-    wide = parts(1e-2)
-    narrow = parts(1e-6)
+    of_certain = parts(0.0)
+    of_wide = parts(1e-2)
+    of_narrow = parts(1e-6)
     plain = case.model.predict(case.belief.mean, case.input)
     expected = {
         "mean": plain.mean,
         "covariance": case.expected_covariance(plain.covariance),
     }
     _require_close_parts(
-        "without covariance it is the plain prediction", certain, expected, 1e-8
+        "without covariance it is the plain prediction", of_certain, expected, 1e-8
     )
     require_close(
         "a certain state correlates with nothing",
-        certain["cross covariance"],
-        torch.zeros_like(certain["cross covariance"]),
+        of_certain["cross covariance"],
+        torch.zeros_like(of_certain["cross covariance"]),
         1e-10,
     )
     # A draw's error falls as the root of the covariance's scale, and so slower.
     rate = 5e-2 if case.samples else 1e-3
     for name, value in expected.items():
-        distance = float((wide[name] - value).abs().max())
-        narrow_distance = float((narrow[name] - value).abs().max())
+        distance = float((of_wide[name] - value).abs().max())
+        narrow_distance = float((of_narrow[name] - value).abs().max())
         require(
             narrow_distance <= rate * distance + 1e-9,
             f"the {name} approaches the plain prediction as the covariance vanishes",
