@@ -21,8 +21,8 @@ With ``--faults`` its sensors fail on the ellipse, in calm air and in the wind: 
 of one state at a time, steps without a measurement, and a second in which all of them
 are frozen, or positions are in another unit. RMSE over the same steps, without and with
 online learning; "sound" is the ratio to online learning in the same air with sound
-sensors. The controller acts on a wrong measurement either way, and what that costs
-stands in the columns without learning.
+sensors. Without learning the controller acts on a wrong measurement, and what that
+costs stands in the columns "as learned"; with it, one in doubt is not acted on.
 """
 
 import argparse

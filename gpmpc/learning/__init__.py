@@ -43,10 +43,17 @@ each step that nothing has explained of late, two at most, as where a sensor is 
 shows another unit for a second, and one for every time that its square is ``surprise``
 times what ``share`` expects. A sensor that repeats itself to the last digit while the
 model moves the plant confirms nothing. Where nothing holds, the next measurement is in
-doubt in its turn, and the model as it was learned plans until one is explained. Steps
-in doubt may end the use of a change, and never begin it, with one exception: where
-several outputs err in the proportion in which an input acts on them, no single sensor
-is wrong, and the change is tried for the one step until it is confirmed.
+doubt in its turn. A wrong measurement may fall together with a change: so the change of
+another plant is also sought over the steps in doubt, as if it began with the first or
+the last of them, and one that has been found is given a second step to be confirmed in.
+
+The controller does not act on a measurement in doubt: it plans from where the model
+expects the plant, with the covariance of that, for two steps at most. After them it
+acts on what is measured, with the model as it was learned, until that is explained.
+Where several outputs err in the proportion in which an input acts on them, no single
+sensor is wrong: such a measurement is acted on, and the change that it shows is tried
+until it is confirmed. Steps in doubt may else end the use of a change, and never begin
+it.
 
 ``_step`` holds this procedure, ``_changed_model`` the model f + B d, ``_state`` what
 one step hands to the next.

@@ -5,6 +5,7 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
+import torch
 
 from gpmpc._arrays import is_measured
 from gpmpc._calls import explains_arguments
@@ -72,11 +73,13 @@ class LearningController:
             options["plan"] = plan
         learning_time = perf_counter() - start
 
-        decision = controller.control(belief, reference, previous, **options)
+        known = _belief(learned, belief)
+        decision = controller.control(known, reference, previous, **options)
         if learned.planning is not None and _has_failed(decision):
             learning_time += decision.timing.total
             learned = learned.without_change()
-            decision = self.controller.control(belief, reference, previous, **options)
+            known = _belief(learned, belief)
+            decision = self.controller.control(known, reference, previous, **options)
         timing = replace(decision.timing, model=decision.timing.model + learning_time)
         return replace(decision, timing=timing, learned=learned)
 
@@ -99,7 +102,7 @@ class LearningController:
         if not is_measured(measured).all():
             return learned.later()
         input = learned.input_of_policy
-        if np.array_equal(previous.means[0], learned.state):
+        if np.array_equal(previous.means[0], learned.planned_state):
             input = previous.input  # that of a decision at the last measurement
         if input is None:
             return learned.after_gap(measured)
@@ -108,6 +111,23 @@ class LearningController:
         except (SettingError, DataError):
             # The points contradict each other beyond double precision.
             return LearningState.begin(self._model, measured, learned.version + 1)
+
+
+def _belief(learned: LearningState, measured: Gaussian) -> Gaussian:
+    """Returns what is known of the state: what is expected if the measurement is wrong.
+
+    Args:
+        learned: From the measurement as well.
+        measured: The measurement.
+    """
+    assumed = learned.assumed
+    if assumed is None:
+        return measured
+    return Gaussian(
+        torch.as_tensor(assumed.mean).to(measured.mean),
+        torch.as_tensor(assumed.covariance).to(measured.mean),
+        measured.names,
+    )
 
 
 def _has_failed(decision: Decision) -> bool:

@@ -6,37 +6,95 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from gpmpc._angles import state_difference
-from gpmpc._dynamics import Array, linearize
+from gpmpc._dynamics import Array, DynamicsModel, linearize
 from gpmpc.learning._changed_model import ChangedModel
 from gpmpc.learning._innovation import Innovation, LearningStep
 
 
 class Expectation(NamedTuple):
-    """A prediction of where the plant is."""
+    """A prediction of where the plant is, some steps after a state that is known."""
 
     mean: Array  #: of the state (n,)
     covariance: Array  #: of the state (n, n)
-    by_input: Array  #: derivative of the mean by the last input (n, m)
+    #: derivative of the mean by what all inputs since then are off by (n, m)
+    by_input: Array
+    #: derivative of the mean by a change d that acts since then (n, k)
+    by_change: Array
 
     @classmethod
-    def certain(cls, state: Array) -> "Expectation":
+    def certain(cls, state: Array, change: ChangedModel) -> "Expectation":
         """Returns the expectation of a state (n,) that is known."""
         n = len(state)
-        return cls(state, np.zeros((n, n)), np.zeros((n, 0)))
+        return cls(
+            mean=state,
+            covariance=np.zeros((n, n)),
+            by_input=np.zeros((n, change.model.input_dim)),
+            by_change=np.zeros((n, change.gp.output_dim)),
+        )
+
+    def after(
+        self, step: LearningStep, model: DynamicsModel, change: ChangedModel
+    ) -> "Expectation":
+        """Predicts where the plant is after a step.
+
+        Args:
+            step: Of the flight; its input and noise count.
+            model: That predicts: ``change``, or the one that this changes.
+            change: Knows how d acts, and the noise of what is measured.
+        """
+        local = linearize(model, self.mean[None], step.input[None])
+        A = local.A[0]
+        B = change.B_array
+        latent = cast(Array, local.covariance)[0]
+        noise = (B * step.noise_variance) @ B.T + np.diag(change.further_noise)
+        return Expectation(
+            mean=local.mean[0],
+            covariance=A @ self.covariance @ A.T + latent + noise,
+            by_input=A @ self.by_input + local.B[0],
+            by_change=A @ self.by_change + B,
+        )
+
+
+class NewPlant(NamedTuple):
+    """Another plant that may explain what is in doubt."""
+
+    model: ChangedModel  #: whose change only steps in doubt have taught
+    #: where the plant is by it, if the last measurement is wrong; None if it is right
+    expected: Expectation | None
+    confirmations_left: int  #: steps that have still to confirm it
+    tried: bool  #: whether it plans before it is confirmed
+
+    def after(self, step: LearningStep) -> Expectation:
+        """Predicts where the plant is after a step."""
+        start = self.expected
+        if start is None:
+            start = Expectation.certain(step.state, self.model)
+        return start.after(step, self.model, self.model)
 
 
 class Doubt(NamedTuple):
     """A measurement that is held back until the next one explains it."""
 
-    expected: Expectation  #: where the plant is if the measurement was wrong
+    expected: Expectation  #: where the plant is if all measurements in doubt are wrong
     #: ``noise_ratios`` of the ``LearningState`` before the steps in doubt (w,)
     trusted_noise_ratios: Array
-    #: the model whose change only the steps in doubt have taught, in case that the
-    #: plant is another one; None where they teach nothing
-    new_plant: ChangedModel | None
-    confirmations_left: int  #: steps that have still to confirm ``new_plant``
+    #: those that the next step may confirm; none where the steps teach nothing
+    new_plants: tuple[NewPlant, ...]
     steps_in_doubt: int  #: for which nothing has explained what is measured
-    tries_new_plant: bool = False  #: whether ``new_plant`` plans before it is confirmed
+    #: whether the controller acts on ``expected`` in the place of the measurement
+    bridged: bool = False
+
+    @property
+    def tried_plant(self) -> NewPlant | None:
+        """The new plant that plans before it is confirmed."""
+        return next((plant for plant in self.new_plants if plant.tried), None)
+
+    @property
+    def assumed(self) -> Expectation | None:
+        """What the controller acts on in the place of the measurement."""
+        if self.tried_plant is not None:
+            return self.tried_plant.expected
+        return self.expected if self.bridged else None
 
 
 @dataclass(frozen=True)
@@ -85,17 +143,31 @@ class LearningState:
     def planning(self) -> ChangedModel | None:
         """The model that plans now; None for the one without a change.
 
-        After two steps in doubt the model plans as it was learned.
+        The model plans as it was learned from a second measurement that nothing
+        explains, where that is not bridged.
         """
-        if self.doubt is not None and self.doubt.tries_new_plant:
-            return self.doubt.new_plant
-        still_unexplained = self.doubt is not None and self.doubt.steps_in_doubt > 1
-        return self.model if self.active and not still_unexplained else None
+        doubt = self.doubt
+        if doubt is None:
+            return self.model if self.active else None
+        if doubt.tried_plant is not None:
+            return doubt.tried_plant.model
+        unexplained = doubt.steps_in_doubt > 1 and not doubt.bridged
+        return self.model if self.active and not unexplained else None
+
+    @property
+    def assumed(self) -> Expectation | None:
+        """What is planned from in the place of the measurement, where that is wrong."""
+        return None if self.doubt is None else self.doubt.assumed
+
+    @property
+    def planned_state(self) -> Array:
+        """The state that is planned from (n,)."""
+        return self.state if self.assumed is None else self.assumed.mean
 
     @property
     def _tries_new_plant(self) -> bool:
         """Whether another plant's model plans before it is confirmed."""
-        return self.doubt is not None and self.doubt.tries_new_plant
+        return self.doubt is not None and self.doubt.tried_plant is not None
 
     @property
     def size(self) -> int:
@@ -132,7 +204,8 @@ class LearningState:
         """
         doubt = self.doubt
         if doubt is not None:
-            doubt = doubt._replace(tries_new_plant=False)
+            plants = tuple(plant._replace(tried=False) for plant in doubt.new_plants)
+            doubt = doubt._replace(new_plants=plants)
         return replace(self, active=False, version=self.version + 1, doubt=doubt)
 
     def without_doubt(self, doubt: Doubt) -> "LearningState":
@@ -165,17 +238,7 @@ class LearningState:
         The model is the one with the change if that is used.
         """
         model = self.model if self.active else self.model.model
-        local = linearize(model, start.mean[None], step.input[None])
-        A = local.A[0]
-        effect = self.model.B_array
-        latent = cast(Array, local.covariance)[0]
-        noise = (effect * step.noise_variance) @ effect.T
-        noise = noise + np.diag(self.model.further_noise)
-        return Expectation(
-            mean=local.mean[0],
-            covariance=A @ start.covariance @ A.T + latent + noise,
-            by_input=local.B[0],
-        )
+        return start.after(step, model, self.model)
 
     def innovation(self, expected: Expectation) -> Innovation:
         """Computes the innovation of the measured state, as far as d can explain it."""

@@ -14,8 +14,7 @@ from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
 from gpmpc.learning._changed_model import ChangedModel, Comparison
 from gpmpc.learning._innovation import LARGEST_LEAD, Innovation, LearningStep
-from gpmpc.learning._settings import OnlineLearning
-from gpmpc.learning._state import Doubt, Expectation, LearningState
+from gpmpc.learning._state import Doubt, Expectation, LearningState, NewPlant
 
 # Differences of errors that say how large the noise is: at least, and at most.
 _FEWEST_RATIOS = 3
@@ -24,7 +23,12 @@ _MOST_RATIOS = 100
 # sensors mark it. Of such numbers even the squares are none.
 _ABSURD = 1e50
 _MISALIGNED = 0.1  # part of errors that no input explains, in deviations, at most
+# Where acting on a measurement is at stake, not a model: squared errors of outputs that
+# err, at least, and what no input explains, at most.
+_NOTABLE = 9.0
+_DEVIATIONS = 3.0
 _MOST_CONFIRMATIONS = 1e6  # for the size of an error
+_LONGEST_BRIDGE = 2  # steps in doubt whose measurement is not acted on, at most
 _PATIENCE = 2  # further confirmations for steps that nothing explained, at most
 
 
@@ -67,7 +71,7 @@ def learn_from_step(
     surprising = innovation.largest_square > model.learning.surprise
     if not surprising and not step.repeats.all():
         return _accept(seen, comparison)
-    expected = seen.expect(Expectation.certain(before.state), step)
+    expected = seen.expect(Expectation.certain(before.state, model), step)
     if surprising or _is_frozen(seen, step, expected):
         return _put_in_doubt(
             seen,
@@ -145,7 +149,6 @@ def _put_in_doubt(
         expected_if_wrong: Where the plant is if all measurements in doubt are wrong.
         trusted_noise_ratios: Those before the steps in doubt.
     """
-    settings = seen.model.learning
     previous_doubt = seen.doubt  # that the measurement did not resolve
     if previous_doubt is None:
         unexplained_steps = seen.unexplained_steps
@@ -154,34 +157,107 @@ def _put_in_doubt(
         unexplained_steps = min(seen.unexplained_steps + 1, _PATIENCE)
         steps_in_doubt = previous_doubt.steps_in_doubt + 1
 
-    new_plant = None
-    confirmations_left = 1 + unexplained_steps
-    tries_new_plant = False
+    new_plants: tuple[NewPlant, ...] = ()
     if not _is_frozen(seen, step, expected_if_wrong):
-        alone = seen.model.without_points().predict_then_learn(step)
-        new_plant = alone.model_with_step.later(1.0)
-        further = alone.with_change.largest_square / settings.surprise
-        confirmations_left += int(min(further, _MOST_CONFIRMATIONS))
-        tries_new_plant = confirmations_left == 1 and _acts_like_input(
-            innovation=comparison.planned(seen.active),
-            by_input=seen.model.B_inverse @ expected_if_wrong.by_input,
-            surprise=settings.surprise,
+        starts = [Expectation.certain(step.state, seen.model)]
+        if previous_doubt is not None and previous_doubt.bridged:
+            # The change began before this step, or with the first step in doubt.
+            starts.append(_begun_now(previous_doubt.expected))
+            starts.append(previous_doubt.expected)
+        new_plants = tuple(
+            _new_plant(seen, step, start, unexplained_steps, steps_in_doubt)
+            for start in starts
         )
-
+        if previous_doubt is not None:
+            new_plants += _without_last_measurement(previous_doubt.new_plants, step)
+    bridged = steps_in_doubt <= _LONGEST_BRIDGE and not _acts_like_input(
+        innovation=seen.innovation(expected_if_wrong),
+        by_input=seen.model.B_inverse @ expected_if_wrong.by_input,
+        notable=_NOTABLE,
+        deviations=_DEVIATIONS,
+    )
+    doubt = Doubt(
+        expected=expected_if_wrong,
+        trusted_noise_ratios=trusted_noise_ratios,
+        new_plants=new_plants,
+        steps_in_doubt=steps_in_doubt,
+        bridged=bridged,
+    )
     in_doubt = replace(
         seen,
         unexplained_steps=unexplained_steps,
-        doubt=Doubt(
-            expected=expected_if_wrong,
-            trusted_noise_ratios=trusted_noise_ratios,
-            new_plant=new_plant,
-            confirmations_left=confirmations_left,
-            steps_in_doubt=steps_in_doubt,
-            tries_new_plant=tries_new_plant,
-        ),
-        version=seen.version + tries_new_plant,
+        doubt=doubt,
+        version=seen.version + (doubt.tried_plant is not None),
     )
     return _count_doubtful_lead(in_doubt, comparison.lead)
+
+
+def _begun_now(start: Expectation) -> Expectation:
+    """Returns an expectation from which on a change acts."""
+    return start._replace(
+        by_input=0.0 * start.by_input, by_change=0.0 * start.by_change
+    )
+
+
+def _without_last_measurement(
+    plants: tuple[NewPlant, ...], step: LearningStep
+) -> tuple[NewPlant, ...]:
+    """Returns new plants of which the last measurement, of a step, was wrong.
+
+    Those of which the one before was wrong already are given up.
+    """
+    return tuple(
+        plant._replace(model=plant.model.later(1.0), expected=plant.after(step))
+        for plant in plants
+        if plant.expected is None
+    )
+
+
+def _new_plant(
+    seen: LearningState,
+    step: LearningStep,
+    start: Expectation,
+    unexplained_steps: int,
+    steps_in_doubt: int,
+) -> NewPlant:
+    """Returns the plant whose change explains a measurement.
+
+    Args:
+        seen: With the measurement.
+        step: That led to it.
+        start: Where the plant was before. The change acts since its derivatives say.
+        unexplained_steps: Each asks for a further confirmation.
+        steps_in_doubt: This one included.
+    """
+    model = seen.model.without_points()
+    surprise = model.learning.surprise
+    expected = start.after(step, model.model, model)
+    error = state_difference(step.next_state, expected.mean, model.angles)
+    from_change = np.linalg.pinv(expected.by_change)
+    variance = ((from_change @ expected.covariance) * from_change).sum(-1)
+    z, v, _ = model.features.linearize(start.mean[None], step.input[None])
+    observed = step._replace(
+        point=np.concatenate([z[0], v[0], [model.time]]),
+        observed_change=from_change @ error,
+        noise_variance=np.maximum(variance - step.latent_variance, step.noise_variance),
+    )
+    alone = model.predict_then_learn(observed)
+    further = alone.with_change.largest_square / surprise
+    confirmations = 1 + unexplained_steps + int(min(further, _MOST_CONFIRMATIONS))
+    tried = False
+    if confirmations <= steps_in_doubt <= _LONGEST_BRIDGE:
+        planned = seen.expect(start, step)
+        tried = _acts_like_input(
+            innovation=seen.innovation(planned),
+            by_input=model.B_inverse @ planned.by_input,
+            notable=surprise,
+        )
+    return NewPlant(
+        model=alone.model_with_step.later(1.0),
+        expected=None,
+        confirmations_left=confirmations,
+        tried=tried,
+    )
 
 
 def _is_frozen(seen: LearningState, step: LearningStep, expected: Expectation) -> bool:
@@ -191,7 +267,9 @@ def _is_frozen(seen: LearningState, step: LearningStep, expected: Expectation) -
     return bool(((motion**2 > threshold) & step.repeats).any())
 
 
-def _acts_like_input(innovation: Innovation, by_input: Array, surprise: float) -> bool:
+def _acts_like_input(
+    innovation: Innovation, by_input: Array, notable: float, deviations: float = 0.0
+) -> bool:
     """Returns whether several outputs err in the proportion in which inputs act.
 
     One wrong sensor is wrong alone, and several are not wrong in that proportion.
@@ -199,15 +277,16 @@ def _acts_like_input(innovation: Innovation, by_input: Array, surprise: float) -
     Args:
         innovation: Of the model that plans.
         by_input: Derivative of what it predicted by the input (k, m).
-        surprise: Squared error over its variance from which on an output errs.
+        notable: Squared error over its variance from which on an output errs.
+        deviations: What noise may add to a proportion.
     """
     deviation = np.sqrt(innovation.variance)
     errors = innovation.error / deviation
     effects = by_input / deviation[:, None]
     coefficients, _, rank, _ = np.linalg.lstsq(effects, errors, rcond=None)
-    several = np.count_nonzero(errors**2 > surprise) > 1
+    several = np.count_nonzero(errors**2 > notable) > 1
     remaining = np.linalg.norm(errors - effects @ coefficients)
-    aligned = remaining <= _MISALIGNED * np.linalg.norm(errors)
+    aligned = remaining <= max(_MISALIGNED * np.linalg.norm(errors), deviations)
     return bool(several and aligned and rank < len(errors))
 
 
@@ -223,18 +302,20 @@ def _resolve_doubt(
     if_moved = comparison.planned(seen.active)
 
     density_to_beat = max(if_wrong.log_density, if_moved.log_density) + LARGEST_LEAD
-    new_plant = _new_plant_if_confirmed(doubt, step, density_to_beat, settings)
-    if new_plant is not None and doubt.confirmations_left == 1:
-        return _switch_plant(seen, new_plant)
-    if new_plant is not None:
-        confirmed = Doubt(
+    plants = [_confirmed(plant, step, density_to_beat) for plant in doubt.new_plants]
+    confirmed = tuple(plant for plant in plants if plant is not None)
+    for plant in confirmed:
+        if plant.confirmations_left == 0:
+            return _switch_plant(seen, plant.model)
+    if confirmed:
+        still = Doubt(
             expected=expected_if_wrong,
             trusted_noise_ratios=doubt.trusted_noise_ratios,
-            new_plant=new_plant.later(1.0),
-            confirmations_left=doubt.confirmations_left - 1,
+            new_plants=tuple(p._replace(model=p.model.later(1.0)) for p in confirmed),
             steps_in_doubt=doubt.steps_in_doubt + 1,
         )
-        return _count_doubtful_lead(replace(seen, doubt=confirmed), comparison.lead)
+        confirmed_once = replace(seen, doubt=still, version=seen.version + 1)
+        return _count_doubtful_lead(confirmed_once, comparison.lead)
     if min(if_moved.largest_square, if_wrong.largest_square) <= settings.surprise:
         return _count_doubtful_lead(seen.without_doubt(doubt), comparison.lead)
     return _put_in_doubt(
@@ -242,25 +323,36 @@ def _resolve_doubt(
     )
 
 
-def _new_plant_if_confirmed(
-    doubt: Doubt, step: LearningStep, density_to_beat: float, settings: OnlineLearning
-) -> ChangedModel | None:
-    """Returns the new plant of a doubt with a step that it explains; None otherwise.
+def _confirmed(
+    plant: NewPlant, step: LearningStep, density_to_beat: float
+) -> NewPlant | None:
+    """Returns a new plant that explains a further step; None where it does not.
 
     Args:
-        doubt: The doubt.
-        step: A further step.
+        plant: The new plant.
+        step: The further step.
         density_to_beat: Log density that the new plant's has to exceed.
-        settings: Those of the learning.
     """
-    if doubt.new_plant is None or step.repeats.all():
+    if step.repeats.all():
         return None
-    comparison = doubt.new_plant.predict_then_learn(step)
-    innovation = comparison.with_change
-    explained = innovation.largest_square <= settings.surprise
-    if explained and innovation.log_density > density_to_beat:
-        return comparison.model_with_step
-    return None
+    model = plant.model
+    if plant.expected is None:
+        comparison = model.predict_then_learn(step)
+        innovation = comparison.with_change
+        model = comparison.model_with_step
+    else:
+        expected = plant.after(step)
+        error = state_difference(step.next_state, expected.mean, model.angles)
+        innovation = Innovation(
+            error=model.B_inverse @ error,
+            variance=model.explainable_variance(expected.covariance),
+        )
+    explained = innovation.largest_square <= model.learning.surprise
+    if not explained or innovation.log_density <= density_to_beat:
+        return None
+    return plant._replace(
+        model=model, expected=None, confirmations_left=plant.confirmations_left - 1
+    )
 
 
 def _switch_plant(seen: LearningState, new_plant: ChangedModel) -> LearningState:

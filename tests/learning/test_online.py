@@ -307,7 +307,7 @@ def test_a_step_is_expected_with_the_noise_of_states_that_no_gp_has():
         latent_variance=np.zeros(1),
         noise_variance=changed.gp_noise,
     )
-    expected = state.expect(Expectation.certain(np.zeros(2)), step)
+    expected = state.expect(Expectation.certain(np.zeros(2), changed), step)
     latent = gp.predict(torch.zeros(2), torch.zeros(1)).covariance
     assert np.allclose(expected.covariance, (latent + noise).numpy())
 
