@@ -74,9 +74,10 @@ static int factorise(gpmpc_program *work)
     return 1;
 }
 
-/* Writes the norms and where rows of G end. The norm is one for a row of zeros, and for
-   one whose squares underflow, which no factor here can hold. Returns what cancellation
-   left of the pivots of P, as a share of P_ii; zero if a norm is not finite. */
+/* Writes the norms and where rows of G end. The norm of a row whose squares underflow is
+   its largest entry: no factor here can hold it, but its violation is seen. That of a
+   row of zeros is one. Returns what cancellation left of the pivots of P, as a share of
+   P_ii; zero if a norm is not finite. */
 static real measure_rows(gpmpc_program *work)
 {
     real *units = work->scratch;
@@ -93,15 +94,19 @@ static real measure_rows(gpmpc_program *work)
     for (i = 0; i < work->rows; i++) {
         const real *row = work->G[i];
         real squares = 0;
+        real largest = 0;
         real norm;
         int end = 0;
         for (j = 0; j < N; j++) {
             real value = row[j] * units[j];
             squares += value * value;
+            largest = larger(largest, absolute(value));
             if (row[j] != 0)
                 end = j + 1;
         }
         norm = SQRT(squares);
+        if (norm == 0)
+            norm = largest;
         undefined += norm * 0;
         work->norm[N + i] = norm > 0 ? norm : 1;
         work->row_end[N + i] = end;
@@ -627,7 +632,6 @@ typedef struct {
     int iterations;
     int limit;      /* of the iterations */
     int batches_left;
-    int violated;    /* whether any constraint was */
     int passed_over; /* whether one contradicts others by what may be rounding */
 } Progress;
 
@@ -705,7 +709,6 @@ static void iterate(gpmpc_program *work, Progress *progress, int starts, int gue
     if (progress->status == GPMPC_SOLVED && violated)
         clip_multipliers(work, k);
     progress->size = k;
-    progress->violated = violated;
 }
 
 /* A working constraint's residual by x, or a hundredth by its own terms. */
@@ -828,7 +831,7 @@ static void take_newton_step(gpmpc_program *work, int k)
 /* Corrects x and the multipliers on the working set until their residual is small, or
    does not halve any more. Returns the residual. */
 static real refine(const gpmpc_problem *problem, gpmpc_program *work, int k,
-                   real tolerance, real *length, int *moved)
+                   real tolerance, real *length)
 {
     real best = INFINITY;
     real residual = INFINITY;
@@ -839,7 +842,6 @@ static real refine(const gpmpc_problem *problem, gpmpc_program *work, int k,
         if (residual <= tolerance || step == REFINEMENTS || !(residual < best / 2))
             break;
         best = residual;
-        *moved = 1;
         take_newton_step(work, k);
     }
     return residual;
@@ -931,14 +933,13 @@ static void solve_opened(const gpmpc_problem *problem, gpmpc_program *work,
                          const gpmpc_solution *guess, int limit,
                          gpmpc_solution *solution)
 {
-    Progress progress = {GPMPC_NUMERICAL_TROUBLE, 0, 0, limit, BATCHES, 0, 0};
+    Progress progress = {GPMPC_NUMERICAL_TROUBLE, 0, 0, limit, BATCHES, 0};
     real fine = smaller(FINE, GPMPC_TOLERANCE);
     real margin = LATER * work->length_of_q; /* small ones wait for the refined x */
     int first_round = 1;
     int rounds = 0;
     int count = 0;
-    int finest = 0;  /* whether x is to be as good as can be */
-    int changed = 0; /* whether anything did, since violations were listed */
+    int finest = 0; /* whether x is to be as good as can be */
     int guessed = start(work, guess);
     int i;
     if (guess->rows == work->rows && guess->status == GPMPC_ITERATION_LIMIT)
@@ -947,7 +948,6 @@ static void solve_opened(const gpmpc_problem *problem, gpmpc_program *work,
         real pivot_share, largest_residual, tolerance, residual, length = 0;
         if (first_round || count > 0) {
             iterate(work, &progress, first_round, guessed, count, margin);
-            changed = changed || progress.violated;
             if (progress.status != GPMPC_SOLVED)
                 break;
         }
@@ -962,15 +962,14 @@ static void solve_opened(const gpmpc_problem *problem, gpmpc_program *work,
         finest = finest || progress.passed_over || pivot_share < ILL;
         largest_residual = DOUBT * pivot_share;
         tolerance = smaller(finest ? FINEST : fine, largest_residual);
-        residual = refine(problem, work, progress.size, tolerance, &length, &changed);
+        residual = refine(problem, work, progress.size, tolerance, &length);
         progress.status = residual <= smaller(GPMPC_TOLERANCE, largest_residual)
                               ? GPMPC_SOLVED
                               : GPMPC_NUMERICAL_TROUBLE;
         rounds++;
-        if ((!changed && margin == 0) || rounds == ROUNDS || residual >= UNDEFINED)
+        if (rounds == ROUNDS || residual >= UNDEFINED)
             break;
         margin = 0;
-        changed = 0;
         /* the error of x may hide a violation */
         count = list_violated(work, finest ? 0 : -residual * length / pivot_share);
         if (count == 0)
@@ -978,7 +977,6 @@ static void solve_opened(const gpmpc_problem *problem, gpmpc_program *work,
         if (!finest) { /* refine once more before these are believed */
             finest = 1;
             count = 0;
-            changed = 1;
         }
     }
     if ((progress.passed_over || rounds == ROUNDS) && progress.status == GPMPC_SOLVED

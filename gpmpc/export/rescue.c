@@ -477,7 +477,7 @@ static void rescue_solution(const gpmpc_problem *problem, gpmpc_program *work,
                             gpmpc_solution *solution)
 {
     static const real dependent[DISTANCES] = DEPENDENT_DISTANCES;
-    Progress progress = {GPMPC_NUMERICAL_TROUBLE, 0, 0, 0, 0, 0, 0};
+    Progress progress = {GPMPC_NUMERICAL_TROUBLE, 0, 0, 0, 0, 0};
     Rescue rescue;
     int guessed = solution->working;
     int attempt, i;
@@ -502,5 +502,10 @@ static void rescue_solution(const gpmpc_problem *problem, gpmpc_program *work,
             break;
     }
     progress.size = rescue.size;
-    write_solution(work, &progress, solution);
+    if (progress.status != GPMPC_NUMERICAL_TROUBLE) {
+        write_solution(work, &progress, solution);
+    } else { /* x of before is as good */
+        solution->status = progress.status;
+        solution->iterations = progress.iterations;
+    }
 }

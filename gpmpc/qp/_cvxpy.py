@@ -37,7 +37,7 @@ from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_rescue import polish
 from gpmpc.qp._primal_active_set import farkas_ray
-from gpmpc.qp._problem import ABSENT, QuadraticProgram, check_positive
+from gpmpc.qp._problem import ABSENT, QuadraticProgram, as_program, check_positive
 from gpmpc.qp._solution import QPSolution, WarmStart, largest_residual, make_solution
 from gpmpc.status import Status
 
@@ -66,7 +66,7 @@ class CvxpySolver:
         name: An installed CVXPY solver ("CLARABEL", "OSQP", "SCS", "HIGHS", ...).
         options: The solver's own options, by its own names; if omitted, Clarabel is
             first asked for tight tolerances.
-        tolerance: Largest scaled KKT residual of a solution called ``SOLVED``.
+        tolerance: Largest of the ``residuals()`` of a solution called ``SOLVED``.
 
     Raises:
         ProblemError: A solver that CVXPY does not find (the message lists those it
@@ -96,6 +96,7 @@ class CvxpySolver:
         A warm start's x is offered to solvers that take one.
         """
         began = perf_counter()
+        problem = as_program(problem)
         compiled = _compile_for(problem)
         transform = _Transform.of(problem)
         transform.write_parameters(compiled, problem)
@@ -119,8 +120,7 @@ class CvxpySolver:
             )
             if solution.status is Status.INFEASIBLE:
                 return solution
-            # no interior point reaches zero
-            residual = largest_residual(solution, zero=1.0)
+            residual = largest_residual(solution)
             if solution.status is Status.SOLVED and residual <= self.tolerance:
                 return solution
             if best is None or residual < least:
@@ -130,7 +130,10 @@ class CvxpySolver:
         if best.status is Status.SOLVED:
             best.record[layout.STATUS] = layout.NUMERICAL_TROUBLE
             if self.options is None:  # its working set may be right all the same
-                return polish(best, self.tolerance, zero=1.0)
+                began = perf_counter()
+                polished = polish(best, self.tolerance)
+                seconds = best.solve_seconds + perf_counter() - began
+                return polished._replace(solve_seconds=seconds)
         return best
 
     def _run(self, program: Any, warm_start: bool, options: dict | None) -> Status:

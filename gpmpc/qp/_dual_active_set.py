@@ -15,6 +15,7 @@ digits, and an infeasibility without Farkas' proof are tried again with doubled 
 ``Status.NUMERICAL_TROUBLE``.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
 
@@ -23,15 +24,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from gpmpc._calls import explains_arguments
 from gpmpc._compiled import compile_for, unchecked_entry_point
-from gpmpc.exceptions import ProblemError
 from gpmpc.qp import _record as layout
 from gpmpc.qp._dual_kernels import SIGNATURE, solve_kernel
 from gpmpc.qp._dual_rescue import rescue
 from gpmpc.qp._problem import (
     QuadraticProgram,
+    as_program,
     check_iteration_limit,
     check_positive,
     multiplier_caps,
+    shape_of,
 )
 from gpmpc.qp._solution import QPSolution, WarmStart, as_record, proves_infeasibility
 from gpmpc.qp._workspace import new_memory, prepare_memory, with_limit
@@ -75,7 +77,9 @@ class DualActiveSet:
         iteration_limit: Changes of the working set before ``ITERATION_LIMIT``, those of
             a second try and of doubled digits included; ample if omitted. It is looked
             at between steps, in one of which several constraints may enter or leave.
-            Under a time limit it may be passed by up to 50 changes.
+            Under a time limit it may be passed by up to 50 changes. Guessed constraints
+            that enter before the first step, and those that leave because their
+            multipliers are wrong, do not count.
         time_limit: Seconds before ``TIME_LIMIT``; none if omitted.
 
     Raises:
@@ -141,12 +145,9 @@ class DualActiveSet:
         except (AttributeError, KeyError, TypeError, ValueError):
             # The first program of its shape, an unchecked one without a shape, prices
             # that are no numbers, or no program at all
-            if not isinstance(problem, tuple):
-                got = type(problem).__name__
-                raise ProblemError(
-                    f"problem must be QuadraticProgram(...); got {got}"
-                ) from None
-            problem = QuadraticProgram.from_stacked(*problem)
+            problem = as_program(problem)
+            if not _has_size(problem):
+                problem = QuadraticProgram.from_stacked(*problem)
             workplace = self._workplace(problem.G.shape, prices)
         P, q, G, lower, upper = problem
         caps, memory, record_size, x_slice = workplace
@@ -181,9 +182,8 @@ class DualActiveSet:
         Raises:
             ProblemError: As for ``solve``.
         """
-        return Prepared(
-            self, QuadraticProgram(P, np.zeros(len(np.atleast_1d(P))), G), prices
-        )
+        q = np.zeros(shape_of("P", P)[:1])
+        return Prepared(self, QuadraticProgram(P, q, G), prices)
 
     def _priced_workplace(self, shape: tuple, prices: ArrayLike) -> Workplace:
         """Returns what solves of this shape of G and these prices of rows share.
@@ -254,30 +254,15 @@ class DualActiveSet:
             status = solve_kernel(*problem, guess, memory, record)
         else:
             problem = _for_kernel(problem)
-        kernel_status = status  # the record's may say more: that time is up
 
         def late() -> bool:
             if self.time_limit is None:
                 return False
             return perf_counter() - began > self.time_limit
 
-        limit = self._limit(len(problem.lower))
-        iterations = record[layout.ITERATIONS]
-        while (
-            kernel_status == layout.ITERATION_LIMIT
-            and not late()
-            and iterations < limit
-        ):
-            guess = record  # the kernel stopped to have the clock looked at
-            record = np.empty_like(record)
-            kernel_status = solve_kernel(*problem, guess, memory, record)
-            iterations += record[layout.ITERATIONS]
-        record[layout.ITERATIONS] = iterations
-        is_at_limit = kernel_status == layout.ITERATION_LIMIT
-        if is_at_limit and late():
-            record[layout.STATUS] = layout.TIME_LIMIT
-        is_at_own_limit = is_at_limit and self.iteration_limit is not None
-        if is_at_own_limit or _is_final(record, problem, caps):
+        changes_left = self._limit(len(problem.lower))
+        record = _go_on(problem, memory, status, record, changes_left, late)
+        if self._is_final(record, problem, caps):
             return problem, record
 
         # A second try from the last working set. Its factor is computed anew, as only
@@ -285,16 +270,32 @@ class DualActiveSet:
         # it returns MISUSE: the copy then stays as it is.
         guess = record
         record = record.copy()
-        keeps_count = self.iteration_limit is not None  # an ample limit begins anew
-        if keeps_count:
-            memory = with_limit(memory, limit - iterations)
-        solve_kernel(*problem, guess, memory, record)
+        iterations = int(guess[layout.ITERATIONS])
+        if self.iteration_limit is not None:  # an ample limit begins anew
+            changes_left = self.iteration_limit - iterations
+            memory = with_limit(memory, changes_left)
+        status = solve_kernel(*problem, guess, memory, record)
+        record = _go_on(problem, memory, status, record, changes_left, late)
         record[layout.ITERATIONS] += iterations
-        if not _is_final(record, problem, caps):
-            if keeps_count:
-                limit -= int(record[layout.ITERATIONS])
-            record = rescue(problem, caps, record, limit, late)
+        if not self._is_final(record, problem, caps):
+            if self.iteration_limit is not None:
+                changes_left = self.iteration_limit - int(record[layout.ITERATIONS])
+            record = rescue(problem, caps, record, changes_left, late)
         return problem, record
+
+    def _is_final(self, record: Array, problem: QuadraticProgram, caps: Array) -> bool:
+        """Returns whether a record needs no second look.
+
+        An infeasible one needs Farkas' proof, and a limit is one that was asked for.
+        """
+        status = record[layout.STATUS]
+        if status == layout.INFEASIBLE:
+            ray = record[layout.HEADER + len(problem.q) :][: len(problem.lower)]
+            _, _, G, lower, upper = problem
+            return proves_infeasibility(ray, G, lower, upper, caps)
+        if status == layout.ITERATION_LIMIT:
+            return self.iteration_limit is not None
+        return status in (layout.SOLVED, layout.TIME_LIMIT)
 
 
 class Prepared:
@@ -377,12 +378,42 @@ def _for_kernel(problem: QuadraticProgram) -> QuadraticProgram:
     return QuadraticProgram.unchecked(P, q, G, lower, upper)
 
 
-def _is_final(record: Array, problem: QuadraticProgram, caps: Array) -> bool:
-    """Returns whether a record needs no second look.
+def _go_on(
+    problem: QuadraticProgram,
+    memory: Array,
+    status: int,
+    record: Array,
+    changes_left: int,
+    late: Callable[[], bool],
+) -> Array:
+    """Goes on where the kernel stopped to have the clock looked at.
 
-    An infeasible one needs Farkas' proof.
+    Args:
+        problem: What is solved.
+        memory: As for the kernel.
+        status: What the kernel returned.
+        record: What it wrote.
+        changes_left: Changes of the working set before ``ITERATION_LIMIT``.
+        late: Whether it is time for ``TIME_LIMIT``.
+
+    Returns:
+        The last record, with the changes of all.
     """
-    if record[layout.STATUS] == layout.INFEASIBLE:
-        ray = record[layout.HEADER + len(problem.q) :][: len(problem.lower)]
-        return proves_infeasibility(ray, problem.G, problem.lower, problem.upper, caps)
-    return record[layout.STATUS] in (layout.SOLVED, layout.TIME_LIMIT)
+    changes = record[layout.ITERATIONS]
+    while status == layout.ITERATION_LIMIT and not late() and changes < changes_left:
+        guess = record
+        record = np.empty_like(record)
+        status = solve_kernel(*problem, guess, memory, record)
+        changes += record[layout.ITERATIONS]
+    record[layout.ITERATIONS] = changes
+    if status == layout.ITERATION_LIMIT and late():
+        record[layout.STATUS] = layout.TIME_LIMIT
+    return record
+
+
+def _has_size(problem: QuadraticProgram) -> bool:
+    """Returns whether rows of an unchecked program have the length of its q."""
+    _, q, G, _, _ = problem
+    if not (isinstance(q, np.ndarray) and isinstance(G, np.ndarray)):
+        return False
+    return q.size > 0 and G.ndim == 2 and q.shape == G.shape[1:]

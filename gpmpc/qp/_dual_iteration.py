@@ -73,7 +73,6 @@ class Progress(NamedTuple):
     size: int  # of the working set
     iterations: int
     batches_left: int
-    violated: bool  # whether any constraint was
     passed_over: bool  # whether one contradicts others by what may be rounding
 
 
@@ -164,7 +163,6 @@ def iterate(
         size=k,
         iterations=iterations,
         batches_left=batches_left,
-        violated=violated,
         passed_over=passed_over,
     )
 

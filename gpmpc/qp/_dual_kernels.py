@@ -267,7 +267,6 @@ def _solve_opened(work, guess, out):
     rounds = 0
     count = 0  # of the listed violated constraints
     finest = False  # whether x is to be as good as can be
-    changed = False  # whether x or the working set did, since violations were listed
     passed_over = False
     status = NUMERICAL_TROUBLE
     while True:
@@ -279,16 +278,14 @@ def _solve_opened(work, guess, out):
             k = progress.size
             iterations = progress.iterations
             batches_left = progress.batches_left
-            changed = changed or progress.violated
             passed_over = passed_over or progress.passed_over
             status = progress.status
             if status != SOLVED:
                 break
         first_round = False
 
-        # refine x, as good as can be where that is in doubt, and judge it. The loop
-        # ends here if nothing changed since violations were listed at a margin of zero.
-        # Written out: a function that returns all this costs 9 s of compilation
+        # refine x, as good as can be where that is in doubt, and judge it. Written out:
+        # a function that returns all this costs 9 s of compilation
         _put_on_bounds(work, k)
         # an error of mu is magnified by K_WW = W W', but reaches x through W' alone: by
         # the root of that
@@ -298,10 +295,8 @@ def _solve_opened(work, guess, out):
         refined = refine(work, k, min(_FINEST if finest else fine, largest_residual))
         accurate = refined.residual <= min(work.tolerance, largest_residual)
         status = SOLVED if accurate else NUMERICAL_TROUBLE
-        changed = changed or refined.moved
         rounds += 1
-        settled = not changed and margin == 0.0
-        if settled or rounds == _ROUNDS or refined.residual >= UNDEFINED:
+        if rounds == _ROUNDS or refined.residual >= UNDEFINED:
             break
         margin = 0.0
 
@@ -312,7 +307,6 @@ def _solve_opened(work, guess, out):
         if count == 0:
             break
         must_iterate = finest  # else x is refined once more before these are believed
-        changed = not finest
         finest = True
     unsure = passed_over or rounds == _ROUNDS  # of the violations that are left
     if unsure and status == SOLVED and worst_violation(work) > _TOLERATED_IF_DEPENDENT:

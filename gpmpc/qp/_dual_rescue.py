@@ -48,6 +48,8 @@ _DEPENDENT_DISTANCES = (1e-14, 1e-13, 1e-12, 1e-10)
 # A guessed constraint is this many times as far from the others: if it is nearer and
 # does matter, it is found violated and enters later.
 _GUESS_MARGIN = 1e6
+# Residuals up to this are rounding: then the point of doubled digits is the better one.
+_ROUNDED = 1e-13
 # A solution that takes more changes was none: they cost a factorisation each.
 _CHANGES_OF_POLISH = 20
 _CONVERGED = 1e-12  # last correction of x, as a share of its size
@@ -74,6 +76,7 @@ def rescue(
     """
     P, q, G, lower, upper = problem
     result = record.copy()
+    status = layout.NUMERICAL_TROUBLE
     iterations = 0
     try:
         lower = np.where(lower <= -ABSENT, -np.inf, lower)
@@ -83,22 +86,22 @@ def rescue(
             solver = _AccurateSolver(
                 (P, q, G, lower, upper), caps, dependent_distance, late
             )
-            result[layout.STATUS] = solver.run(labels, limit - iterations)
+            status = solver.run(labels, limit - iterations)
             iterations += solver.iterations
-            if result[layout.STATUS] != layout.NUMERICAL_TROUBLE:
+            if status != layout.NUMERICAL_TROUBLE:  # else the kernel's x is as good
+                solver.write(result)
                 break
-        # that of the last distance, also where none succeeded
-        solver.write(result)  # pyright: ignore[reportPossiblyUnboundVariable]
-        result[layout.ITERATIONS] += iterations
     except TimeoutError:
-        result[layout.STATUS] = layout.TIME_LIMIT
+        status = layout.TIME_LIMIT
     except (ArithmeticError, ValueError, np.linalg.LinAlgError):
         # not finite, or not positive definite once scaled
-        result[layout.STATUS] = layout.NUMERICAL_TROUBLE
+        status = layout.NUMERICAL_TROUBLE
+    result[layout.STATUS] = status
+    result[layout.ITERATIONS] += iterations
     return result
 
 
-def polish(solution: QPSolution, tolerance: float, zero: float = 1e-12) -> QPSolution:
+def polish(solution: QPSolution, tolerance: float) -> QPSolution:
     """Returns the better of a solution and what doubled digits make of it, judged.
 
     They change the last digits only of a solution whose working set is right. From a
@@ -107,16 +110,15 @@ def polish(solution: QPSolution, tolerance: float, zero: float = 1e-12) -> QPSol
     Args:
         solution: Of any solver.
         tolerance: Largest residual of what is called ``SOLVED``.
-        zero: As for ``QPSolution.residuals``.
     """
     record = rescue(solution.arrays, solution.caps, solution.record)
     x = record[layout.HEADER :][: len(solution.x)]
     polished = solution._replace(x=x, record=record)
     if polished.status is Status.INFEASIBLE:  # which is proven
         return polished
-    before = largest_residual(solution, zero)
-    after = largest_residual(polished, zero)
-    better = polished if after <= max(before, tolerance) else solution
+    before = largest_residual(solution)
+    after = largest_residual(polished)
+    better = polished if after <= max(before, _ROUNDED) else solution
     is_solved = min(before, after) <= tolerance
     status = layout.SOLVED if is_solved else layout.NUMERICAL_TROUBLE
     better.record[layout.STATUS] = status
@@ -152,9 +154,9 @@ class _AccurateSolver:
         P, q, G, lower, upper = problem
         n = len(q)
         M = len(lower)
-        D = _power_of_two(np.sqrt(np.diagonal(P)))
+        D = inverse_power_of_two(np.sqrt(np.diagonal(P)))
         E = np.concatenate(
-            [1.0 / D, _power_of_two(np.abs(G * D).max(axis=1, initial=0.0))]
+            [1.0 / D, inverse_power_of_two(np.abs(G * D).max(axis=1, initial=0.0))]
         )
         self.D = D
         self.E = E
@@ -165,6 +167,14 @@ class _AccurateSolver:
         self.lower = lower * E
         self.upper = upper * E
         self.caps = caps / E
+        for scaled, given in (
+            (self.lower, lower),
+            (self.upper, upper),
+            (self.caps, caps),
+        ):
+            # an infinite bound or price would count as none
+            if (np.isinf(scaled) & np.isfinite(given)).any():
+                raise OverflowError
         self.unscaled_G = G
         self.unscaled_bounds = (lower, upper)
         self.late = late
@@ -478,7 +488,7 @@ class _AccurateSolver:
         return proven
 
 
-def _power_of_two(sizes: Array) -> Array:
+def inverse_power_of_two(sizes: Array) -> Array:
     """Returns the powers of two nearest to the reciprocals; one for zero."""
     return np.exp2(-np.round(np.log2(np.where(sizes > 0.0, sizes, 1.0))))
 

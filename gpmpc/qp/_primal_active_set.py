@@ -35,10 +35,11 @@ from scipy.optimize import linprog
 
 from gpmpc._calls import explains_arguments
 from gpmpc.qp import _record as layout
-from gpmpc.qp._dual_rescue import polish
+from gpmpc.qp._dual_rescue import inverse_power_of_two, polish
 from gpmpc.qp._problem import (
     ABSENT,
     QuadraticProgram,
+    as_program,
     check_iteration_limit,
     check_positive,
 )
@@ -112,17 +113,25 @@ class PrimalActiveSet:
     ) -> QPSolution:
         """Solves one problem, from a warm start of any kind; see ``QPSolver``."""
         began = perf_counter()
-        rows = _one_sided(problem)
+        problem = as_program(problem)
+        units = _units_of_x(problem)
+        scaled = _scale(problem, units)
+        rows = _one_sided(scaled)
         warm_record = as_record(warm_start, len(problem.q), len(problem.lower))
         start, labels = _read_warm_start(warm_record, problem)
-        x, ray = _phase_1(rows, start, len(problem.lower))
+        x, ray = _phase_1(rows, start / units, len(problem.lower))
         if ray is None:
             working = _guessed_rows(rows, x, labels)
-            outcome = self._iterate(problem, rows, x, working)
+            outcome = self._iterate(scaled, rows, x, working)
+            multipliers = outcome.multipliers
+            if multipliers is not None:
+                multipliers = _unscale_multipliers(multipliers, units)
+            outcome = outcome._replace(x=outcome.x * units, multipliers=multipliers)
         else:
+            ray = _unscale_multipliers(ray, units)
             proven = proves_infeasibility(ray, problem.G, problem.lower, problem.upper)
             status = Status.INFEASIBLE if proven else Status.NUMERICAL_TROUBLE
-            outcome = _Outcome(status, x, iterations=0, multipliers=ray)
+            outcome = _Outcome(status, x * units, iterations=0, multipliers=ray)
         solution = self._polish_and_judge(problem, outcome)
         return solution._replace(solve_seconds=perf_counter() - began)
 
@@ -189,6 +198,50 @@ class PrimalActiveSet:
         return solution
 
 
+def _units_of_x(problem: QuadraticProgram) -> Array:
+    """Returns units (n,), powers of two, in which x is of order one, and P_jj alike.
+
+    The thresholds of the method are then shares of the size of x. They are one where
+    numbers in such units overflow.
+    """
+    P, q, G, lower, upper = problem
+    units = inverse_power_of_two(np.sqrt(np.diagonal(P)))
+    free_length = np.abs(q * units).max()
+    # how far x must go to reach the bounds, in the metric of P's diagonal
+    distances = np.maximum(np.where(lower > -ABSENT, lower, 0.0), 0.0)
+    distances = np.maximum(distances, np.where(upper < ABSENT, -upper, 0.0))
+    norms = np.concatenate([units, np.linalg.norm(G * units, axis=1)])
+    reached = norms > 0.0
+    bound_length = (distances[reached] / norms[reached]).max()
+    units = units / inverse_power_of_two(max(free_length, bound_length))
+    scaled_P = P * np.outer(units, units)
+    extremes = [
+        scaled_P.max(),
+        np.abs(q * units).max(),
+        np.abs(G * units).max(initial=0.0),
+    ]
+    return units if np.isfinite(extremes).all() else np.ones(len(q))
+
+
+def _scale(problem: QuadraticProgram, units: Array) -> QuadraticProgram:
+    """Returns the program of x in other units (n,)."""
+    P, q, G, lower, upper = problem
+    bound_units = np.concatenate([units, np.ones(len(G))])
+    return QuadraticProgram.unchecked(
+        P * np.outer(units, units),
+        q * units,
+        G * units,
+        np.where(lower > -ABSENT, lower, -np.inf) / bound_units,
+        np.where(upper < ABSENT, upper, np.inf) / bound_units,
+    )
+
+
+def _unscale_multipliers(multipliers: Array, units: Array) -> Array:
+    """Returns the multipliers (M,) of the program whose x was in these units (n,)."""
+    n = len(units)
+    return np.concatenate([multipliers[:n] / units, multipliers[n:]])
+
+
 def _read_warm_start(record: Array, problem: QuadraticProgram) -> tuple[Array, Array]:
     """Returns the point and the labels of working constraints to start from."""
     n = len(problem.q)
@@ -213,7 +266,7 @@ def _guessed_rows(rows: _Rows, x: Array, labels: Array) -> list[int]:
 
 
 def _one_sided(problem: QuadraticProgram) -> _Rows:
-    """Returns the bounds that are there as rows ``a'x <= h`` of unit length.
+    """Returns the finite bounds as rows ``a'x <= h`` of unit length.
 
     Zero rows stay zero.
     """
@@ -221,8 +274,8 @@ def _one_sided(problem: QuadraticProgram) -> _Rows:
     upper = problem.upper
     C = np.vstack([np.eye(len(problem.q)), problem.G])
     equal = lower == upper
-    above = np.flatnonzero(upper < ABSENT)
-    below = np.flatnonzero((lower > -ABSENT) & ~equal)
+    above = np.flatnonzero(np.isfinite(upper))
+    below = np.flatnonzero(np.isfinite(lower) & ~equal)
     stacked = np.concatenate([above, below])
     norms = np.linalg.norm(C, axis=1)[stacked]
     scale = np.repeat([1.0, -1.0], [len(above), len(below)]) / np.where(
@@ -269,9 +322,13 @@ def farkas_ray(problem: QuadraticProgram) -> Array | None:
 
     None if it finds none.
     """
-    _, ray = _phase_1(_one_sided(problem), np.zeros(len(problem.q)), len(problem.lower))
+    units = _units_of_x(problem)
+    rows = _one_sided(_scale(problem, units))
+    start = np.zeros(len(problem.q))
+    _, ray = _phase_1(rows, start, len(problem.lower))
     if ray is None:
         return None
+    ray = _unscale_multipliers(ray, units)
     proven = proves_infeasibility(ray, problem.G, problem.lower, problem.upper)
     return ray if proven else None
 

@@ -26,7 +26,9 @@ Array = NDArray[np.float64]
 
 _new = tuple.__new__
 ABSENT = 1e20  # a bound of this size or more is none
-_SYMMETRY = 1e-10  # largest |P - P'| accepted, as a share of the largest diagonal entry
+# largest |P_ij - P_ji| accepted, as a share of sqrt(P_ii P_jj), which no entry of a
+# positive definite P exceeds, whatever the units of the variables
+_SYMMETRY = 1e-10
 
 
 def _as_float_array(
@@ -64,15 +66,24 @@ def _as_float_array(
     return array
 
 
-def _check_hessian(P: Array) -> None:
-    """Raises ``ProblemError`` unless a finite P is symmetric and positive definite."""
-    skew = np.abs(P - P.T)
-    if skew.max() > _SYMMETRY * np.abs(np.diagonal(P)).max():
-        i, j = np.unravel_index(np.argmax(skew), P.shape)
+def _symmetric_part(P: Array) -> Array:
+    """Returns (P + P')/2, which is P itself if that is symmetric.
+
+    Raises ``ProblemError`` where the two differ by more than rounding.
+    """
+    roots = np.sqrt(np.abs(np.diagonal(P)))
+    excess = np.abs(P - P.T) - _SYMMETRY * np.outer(roots, roots)
+    if excess.max() > 0.0:
+        i, j = np.unravel_index(np.argmax(excess), P.shape)
         raise ProblemError(
             f"P must be symmetric; got P[{i}, {j}] = {P[i, j]:.6g} "
             f"and P[{j}, {i}] = {P[j, i]:.6g}"
         )
+    return P if (P == P.T).all() else 0.5 * P + 0.5 * P.T
+
+
+def _check_definite(P: Array) -> None:
+    """Raises ``ProblemError`` unless a symmetric P is positive definite."""
     try:
         pivots = np.diagonal(np.linalg.cholesky(P)) ** 2
         definite = bool((pivots > len(P) * np.finfo(float).eps * np.diagonal(P)).all())
@@ -225,13 +236,13 @@ def _check_matrices(
     P: ArrayLike, q: ArrayLike, G: ArrayLike | None
 ) -> tuple[tuple[int, int], Array, Array, Array]:
     """Returns (n, m), P, q and G as arrays."""
-    shape = _shape_of("P", P)
+    shape = shape_of("P", P)
     if len(shape) != 2 or shape[0] != shape[1] or shape[0] == 0:
         raise ProblemError(
             f"P must be a square matrix with at least one row; got shape {shape}"
         )
     n = shape[0]
-    rows = _shape_of("G", G) if G is not None else (0, n)
+    rows = shape_of("G", G) if G is not None else (0, n)
     if len(rows) != 2:
         raise ProblemError(f"G must be a matrix of {n} columns; got shape {rows}")
     P = _as_float_array("P", P, (n, n), finite=True)
@@ -241,11 +252,12 @@ def _check_matrices(
         if G is None
         else _as_float_array("G", G, (rows[0], n), finite=True)
     )
-    _check_hessian(P)
+    P = _symmetric_part(P)
+    _check_definite(P)
     return (n, rows[0]), P, q, G
 
 
-def _shape_of(name: str, matrix: ArrayLike) -> tuple[int, ...]:
+def shape_of(name: str, matrix: ArrayLike) -> tuple[int, ...]:
     """Returns the shape of what may be nested lists of one length."""
     try:
         return np.shape(matrix)
@@ -253,6 +265,19 @@ def _shape_of(name: str, matrix: ArrayLike) -> tuple[int, ...]:
         raise ProblemError(
             f"{name} must be a matrix, of rows of one length; got {matrix!r}"
         ) from error
+
+
+def as_program(problem: object) -> QuadraticProgram:
+    """Returns what a solver was asked to solve: a program, or a tuple of its arrays.
+
+    The latter is checked. Anything else raises ``ProblemError``.
+    """
+    if isinstance(problem, QuadraticProgram):
+        return problem
+    if isinstance(problem, tuple) and len(problem) == len(_Arrays._fields):
+        return QuadraticProgram.from_stacked(*problem)
+    got = type(problem).__name__
+    raise ProblemError(f"problem must be QuadraticProgram(...); got {got}")
 
 
 def multiplier_caps(prices: ArrayLike | None, variables: int, rows: int) -> Array:

@@ -42,7 +42,6 @@ class Refinement(NamedTuple):
 
     residual: float  # as a share of the length of x
     length: float  # of x, in the metric of P
-    moved: bool  # whether x changed
 
 
 @inline_njit
@@ -54,7 +53,6 @@ def refine(work, k, tolerance):
     residual = np.inf
     length = 0.0
     best = np.inf
-    moved = False
     for step in range(_STEPS + 1):
         add_multipliers(work, k)
         residual, length = _measure_residual(work, k)
@@ -62,9 +60,8 @@ def refine(work, k, tolerance):
         if residual <= tolerance or step == _STEPS or not halved:
             break
         best = residual
-        moved = True
         _take_newton_step(work, k)
-    return Refinement(residual, length, moved)
+    return Refinement(residual, length)
 
 
 @inline_njit

@@ -94,7 +94,11 @@ class QPSolution(NamedTuple):
 
     @property
     def iterations(self) -> int:
-        """Changes of the working set, or the iterations of the solver behind."""
+        """Changes of the working set, or the iterations of the solver behind.
+
+        Guessed constraints that enter before the first step, and those that leave
+        because their multipliers are wrong, do not count.
+        """
         return int(self.record[layout.ITERATIONS])
 
     @property
@@ -157,8 +161,9 @@ class QPSolution(NamedTuple):
         _, _, G, lower, upper = self.arrays
         x = self.x
         n = len(x)
-        unpaid = np.where(np.abs(self.multipliers) >= self.caps, 0.0, violation)
         violates_upper = np.concatenate([x, G @ x]) > upper
+        paid_for = np.where(violates_upper, self.multipliers, -self.multipliers)
+        unpaid = np.where(paid_for >= self.caps, 0.0, violation)
         bound = np.abs(np.where(violates_upper, upper, lower))
         entries = np.maximum(np.abs(x), zero_entries)
         terms = np.concatenate([entries, np.abs(G) @ entries])
@@ -271,8 +276,11 @@ def make_solution(
         solve_seconds: Time spent on solving it [s].
 
     Raises:
-        ProblemError: Arrays of other shapes.
+        ProblemError: Arrays of other shapes, or a status that no solve ends with.
     """
+    if status not in layout.STATUSES:
+        names = ", ".join(known.name for known in layout.STATUSES)
+        raise ProblemError(f"status must be one of {names}; got {status}")
     x = np.asarray(x, dtype=float)
     multipliers = np.asarray(multipliers, dtype=float)
     n = len(problem.q)

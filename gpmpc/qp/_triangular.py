@@ -18,7 +18,7 @@ from gpmpc._kernels.linalg import dot, four_dots
 _LANES = 8
 _BLOCK = 4
 _ROUNDING = 2.3e-16  # times n: share of P_ii below which a pivot is rounding
-_SKEW = 1e-10  # largest |P - P'| accepted, as a share of the largest diagonal entry
+_SKEW = 1e-10  # largest |P_ij - P_ji| accepted, as a share of sqrt(P_ii P_jj)
 
 
 @inline_njit
@@ -235,13 +235,13 @@ def factorise(P, L):
     its upper triangle is undefined.
     """
     n = len(P)
-    largest = 0.0
+    roots = L[n - 1]  # of P_ii, until the factor is written there
     skewed = 0
     for i in range(n):
-        largest = max(largest, abs(P[i, i]))
+        roots[i] = math.sqrt(abs(P[i, i]))
     for i in range(n):
         for j in range(i):
-            skewed += not abs(P[i, j] - P[j, i]) <= _SKEW * largest
+            skewed += not abs(P[i, j] - P[j, i]) <= _SKEW * roots[i] * roots[j]
     top = n // _BLOCK * _BLOCK
     good = skewed == 0 and _finish_last_rows(P, L, top)
     while good and top > 0:

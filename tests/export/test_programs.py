@@ -38,6 +38,16 @@ def test_a_zero_row_proves_infeasibility_beyond_rounding_only(compiled):
         assert compiled.solve(problem).status is status
 
 
+def test_a_row_whose_squares_underflow_is_not_taken_as_satisfied(compiled):
+    rows = [[1e-170, 2e-170], [1.0, 1.0], [0.0, 1.0]]
+    for bound, satisfied in ((-1e-170, False), (1e-165, True)):
+        problem = QuadraticProgram(
+            np.eye(2), [1.0, -2.0], rows, h_upper=[bound, 9.0, 9.0]
+        )
+        assert DualActiveSet().solve(problem).status is Status.SOLVED
+        assert compiled.solve(problem).status.solved is satisfied
+
+
 PRICED_ROWS = [[1e7, 0.0], [0.0, 1e-6], [-1.0, -1.0]]
 
 

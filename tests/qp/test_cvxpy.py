@@ -1,5 +1,6 @@
 import subprocess
 import sys
+from time import sleep
 
 import numpy as np
 import pytest
@@ -81,7 +82,26 @@ def test_what_doubled_digits_make_of_an_answer_counts_where_it_is_better():
     problem = feasible_problem(np.random.default_rng(5), 60, 120)
     solution = CvxpySolver("OSQP").solve(problem)
     assert solution.status is Status.NUMERICAL_TROUBLE
-    assert max(solution.residuals(zero=1.0)) < 1e-4
+    assert max(solution.residuals()) < 1e-4
+
+
+@pytest.mark.parametrize("options", [None, {}])
+def test_a_bound_is_kept_however_far_the_free_minimiser_is(options):
+    """x <= 1e-6, from 1e6 without it."""
+    problem = QuadraticProgram([[1.0]], [-1e6], [[1.0]], h_upper=[1e-6])
+    solution = CvxpySolver("CLARABEL", options).solve(problem)
+    assert solution.status.solved is solution.is_optimal(1e-6)
+    assert solution.status.solved is (options is None)
+
+
+def test_doubled_digits_count_in_the_time_of_a_solve(monkeypatch):
+    def polish(solution, tolerance):
+        sleep(0.2)
+        return solution
+
+    monkeypatch.setattr("gpmpc.qp._cvxpy.polish", polish)
+    problem = QuadraticProgram([[1.0]], [-1e6], [[1.0]], h_upper=[1e-6])
+    assert CvxpySolver("OSQP").solve(problem).solve_seconds > 0.2
 
 
 def test_an_iteration_limit_is_translated(rng):

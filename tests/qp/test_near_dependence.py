@@ -8,11 +8,18 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
-from gpmpc.qp._dual_rescue import _AccurateSolver, rescue
+from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram, make_solution
+from gpmpc.qp._dual_rescue import _AccurateSolver, polish, rescue
 from gpmpc.qp._dual_rescue import _add as add_to_pair
-from gpmpc.qp._record import HEADER, INFEASIBLE, SOLVED, STATUS, warm_record
+from gpmpc.qp._record import (
+    HEADER,
+    INFEASIBLE,
+    SOLVED,
+    STATUS,
+    warm_record,
+)
 from gpmpc.status import Status
+from tests.qp.problems import feasible_problem
 
 
 def near_dependent_problem(rng, feasible=True):
@@ -74,6 +81,29 @@ def test_the_primal_method_keeps_a_solution_that_doubled_digits_lose(seed):
     solution = PrimalActiveSet().solve(problem)
     assert solution.status is Status.SOLVED
     assert solution.is_optimal(1e-9)
+
+
+def test_doubled_digits_replace_no_better_solution():
+    """They begin without its working set, and end after a few changes."""
+    problem = feasible_problem(np.random.default_rng(5), 60, 120)
+    solution = DualActiveSet().solve(problem)
+    guessless = make_solution(
+        problem,
+        Status.SOLVED,
+        solution.x,
+        solution.multipliers,
+        active_set=np.zeros(180),
+    )
+    polished = polish(guessless, tolerance=1e3)
+    assert max(polished.residuals()) <= max(solution.residuals())
+
+
+@pytest.mark.parametrize("seed", [7, 66, 226])
+def test_where_doubled_digits_fail_the_iterate_before_stays(seed):
+    problem = near_dependent_problem(np.random.default_rng(seed))
+    solution = DualActiveSet().solve(problem)
+    assert solution.status is Status.NUMERICAL_TROUBLE
+    assert solution.residuals().dual < 1e-12
 
 
 def test_doubled_digits_put_a_multiplier_on_its_cap(rng):

@@ -88,6 +88,34 @@ def test_a_row_whose_squares_no_float_holds_is_not_taken_as_satisfied(
     assert solution.is_optimal(1e-9) or not solution.status.solved
 
 
+def test_a_bound_that_overflows_in_doubled_digits_is_not_absent():
+    problem = QuadraticProgram([[1.0]], [0.0], [[1e-300]], h_lower=[1e19])
+    assert DualActiveSet().solve(problem).status is Status.NUMERICAL_TROUBLE
+    problem = QuadraticProgram([[1.0]], [0.0], [[1e-300]], h_lower=[1.0])
+    solution = DualActiveSet().solve(problem, prices=[1e10])
+    assert solution.is_optimal(1e-9) or not solution.status.solved
+
+
+@pytest.mark.parametrize("unit", [1e-14, 1e-150, 1e14])
+@pytest.mark.parametrize("bound", [0.5, -0.5])
+def test_the_primal_method_has_no_units_of_its_own(unit, bound):
+    """The number of changes is more than doubled digits would make."""
+    n = 30
+    upper = np.full(n, bound * unit)
+    upper[0] = 1e3 * unit
+    problem = QuadraticProgram(
+        np.eye(n) / unit**2,
+        np.full(n, -1.0 / unit),
+        [np.ones(n)],
+        [-n * unit],
+        ub=upper,
+    )
+    solution = PrimalActiveSet().solve(problem)
+    assert solution.status is Status.SOLVED
+    assert solution.is_optimal(1e-12)
+    np.testing.assert_allclose(solution.x, np.minimum(unit, upper), rtol=1e-12)
+
+
 def test_soft_rows_do_not_hide_it():
     P, q = PROBLEMS["in one variable"]
     free = np.append(FREE, 1.0)

@@ -29,6 +29,11 @@ INDEFINITE = np.array([[1.0, 2.0], [2.0, 1.0]])  # eigenvalues -1 and 3
             r"symmetric; got P\[0, 1\] = 0.5 and P\[1, 0\] = 0",
         ),
         (
+            {"P": [[1e8, 1e-3], [0.0, 1e-4]], "q": [0, -1]},
+            r"symmetric; got P\[0, 1\] = 0.001 and P\[1, 0\] = 0",
+        ),
+        ({"P": [[1.0, 1 + 5e-11], [1 - 1e-12, 1.0]], "q": [0, 0]}, "positive definite"),
+        (
             {"P": INDEFINITE, "q": [0, 0]},
             r"smallest eigenvalue \(number 0 of 2, in ascending order\) is -1,",
         ),
@@ -88,6 +93,7 @@ GOOD = {
     [
         ("P", INDEFINITE, "smallest eigenvalue"),
         ("P", np.array([[1.0, 0.5], [0.0, 1.0]]), "symmetric"),
+        ("P", np.array([[1e10, 0.9], [0.0, 1e-12]]), "symmetric"),
         ("P", np.array([[1.0, 0.0], [0.0, np.nan]]), "NaN"),
         ("P", np.ones((2, 3)), "square"),
         ("q", np.array([0.0, np.nan]), "NaN"),
@@ -192,20 +198,47 @@ def test_a_warm_start_of_another_shape_is_misuse(solver):
         solver.solve(QuadraticProgram(EYE, [0.0, 0.0]), np.array([True, False]))
 
 
-@pytest.mark.parametrize("size", [1.0, 1e6])
+@pytest.mark.parametrize("units", [[1.0] * 3, [1e3] * 3, [1e-90, 1.0, 1e9]])
 @pytest.mark.parametrize(("skew", "accepted"), [(5e-11, True), (2e-10, False)])
-def test_what_is_skew_by_rounding_is_taken_for_symmetric(size, skew, accepted):
-    P = size * np.array([[1.0, 0.3, 0.1], [0.3, 0.5, 0.0], [0.1 + skew, 0.0, 0.6]])
+def test_what_is_skew_by_rounding_is_taken_for_symmetric(units, skew, accepted):
+    P = np.array([[1.0, 0.3, 0.1], [0.3, 0.5, 0.0], [0.1 + skew, 0.0, 0.6]])
+    P *= np.outer(units, units)
     program = QuadraticProgram.unchecked(
-        P, np.ones(3), np.zeros((0, 3)), np.full(3, -np.inf), np.full(3, np.inf)
+        P, np.array(units), np.zeros((0, 3)), np.full(3, -np.inf), np.full(3, np.inf)
     )
     if accepted:
-        assert DualActiveSet().solve(program).x == pytest.approx(
-            np.linalg.solve(P, -np.ones(3)), rel=1e-9
+        x = DualActiveSet().solve(program).x * units
+        assert x == pytest.approx(
+            np.linalg.solve(P / np.outer(units, units), -np.ones(3)), rel=1e-9
         )
     else:
         with pytest.raises(ProblemError, match="symmetric"):
             DualActiveSet().solve(program)
+
+
+@pytest.mark.parametrize("solver", [DualActiveSet(), PrimalActiveSet()])
+def test_what_is_no_program_is_misuse(solver):
+    program = QuadraticProgram(EYE, [1.0, 1.0])
+    assert solver.solve(tuple(program)).status is Status.SOLVED
+    for problem in (solver.solve(program), (EYE, [1.0, 1.0]), None):
+        with pytest.raises(ProblemError, match="problem must be QuadraticProgram"):
+            solver.solve(problem)
+
+
+@pytest.mark.parametrize("seed", [15, 39, 62])
+def test_a_program_is_not_judged_by_those_of_its_shape_before(seed):
+    """Cholesky's method refuses P from its first row on, not from its last."""
+    rng = np.random.default_rng(seed)
+    root = rng.integers(-9, 10, (2, 3)) / 7.0
+    P = root.T @ root
+    P += np.diag(np.diagonal(P)) * rng.choice([3e-16, 6e-16, 1e-15])
+    free = np.full(3, np.inf)
+    no_rows = np.zeros((0, 3))
+    program = QuadraticProgram.unchecked(P, P @ np.ones(3), no_rows, -free, free)
+    solver = DualActiveSet()
+    solver.solve(QuadraticProgram(np.eye(3), np.ones(3)))
+    for later_or_first in (solver, DualActiveSet()):
+        assert later_or_first.solve(program).status is Status.SOLVED
 
 
 class TestArraysOfOtherKinds:
@@ -229,6 +262,8 @@ class TestArraysOfOtherKinds:
     def test_rows_of_unlike_length_are_refused(self):
         with pytest.raises(ProblemError, match="P must be a matrix"):
             QuadraticProgram([[1.0], [0.0, 1.0]], [1.0, 1.0])
+        with pytest.raises(ProblemError, match="P must be a matrix"):
+            DualActiveSet().prepare([[1.0], [0.0, 1.0]])
 
     @pytest.mark.parametrize("solver", [DualActiveSet, PrimalActiveSet])
     @pytest.mark.parametrize("limit", [2.5, np.inf, True, 0])

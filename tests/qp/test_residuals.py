@@ -35,7 +35,8 @@ def by_definition(solution):
     for p in range(M):
         value = C[p] @ x
         missed = excess(value, lower[p], upper[p])
-        beyond = 0.0 if abs(y[p]) >= caps[p] else missed
+        paid_for = y[p] if value > upper[p] else -y[p]
+        beyond = 0.0 if paid_for >= caps[p] else missed
         own = sum(abs(C[p, i]) * max(abs(x[i]), zero / units[i]) for i in range(n))
         if beyond:
             primal = max(
