@@ -47,10 +47,13 @@ def read_csv(path: Path, options: ReadOptions) -> LogFile:
         with warnings.catch_warnings():  # of rows that are longer than the header
             warnings.simplefilter("error", pd.errors.ParserWarning)
             table = _read_in_parts(csv, budget)
+    swallowed = csv.stream.rows - len(table)
     table.columns = _column_names(csv)
     units = dict(zip(table.columns, csv.units, strict=False))
     table = unpack_lists(path, _without_empty_end(table), budget)
-    return LogFile({"": with_units(table, units)}, tuple(_findings(path, csv)))
+    return LogFile(
+        {"": with_units(table, units)}, tuple(_findings(path, csv, swallowed))
+    )
 
 
 def _column_names(csv: CsvText) -> list[str]:
@@ -70,8 +73,14 @@ def _without_empty_end(table: pd.DataFrame) -> pd.DataFrame:
     return table.iloc[:, :columns]
 
 
-def _findings(path: Path, csv: CsvText) -> Iterator[Finding]:
-    """Yields what was noticed in a text, once all of it is read."""
+def _findings(path: Path, csv: CsvText, swallowed: int) -> Iterator[Finding]:
+    """Yields what was noticed in a text, once all of it is read.
+
+    Args:
+        path: Of the file.
+        csv: The text.
+        swallowed: Lines that became no row of their own.
+    """
     run = run_name(path)
     if csv.skipped:
         lines = "1 line" if csv.skipped == 1 else f"{csv.skipped} lines"
@@ -80,6 +89,18 @@ def _findings(path: Path, csv: CsvText) -> Iterator[Finding]:
     if not csv.names:
         text = "no line names the columns: they are called by their numbers, 1, 2, ..."
         yield Finding("no names", run, csv.columns, text)
+    if csv.blank:
+        text = (
+            f"{csv.blank} blank lines between rows: left out, and no step of the time "
+            "where rows are counted"
+        )
+        yield Finding("blank lines", run, csv.blank, text)
+    if swallowed > 0:
+        text = (
+            f"{swallowed} lines stand inside texts in quotes, and are no rows: is a "
+            "quote alone in its cell?"
+        )
+        yield Finding("lines in quotes", run, swallowed, text)
     if csv.is_cut:
         text = "the last line has no end, and may be cut within a number: left out"
         yield Finding("cut line", run, 1, text)

@@ -10,6 +10,7 @@ import codecs
 import csv
 import io
 import re
+from array import array
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import chain, islice
@@ -52,6 +53,12 @@ class CsvText(NamedTuple):
     delimiter: str  #: ``WHITE_SPACE`` for any of it
     decimal: str
     skipped: int  #: lines before the rows: neither names, nor units, nor comments
+    head: int  #: lines before the rows, comments and blank ones left out
+
+    @property
+    def blank(self) -> int:
+        """Blank lines between rows, known where all is read."""
+        return sum(row > self.head for row in self.stream.lines.behind_blank)
 
     @property
     def is_cut(self) -> bool:
@@ -105,6 +112,7 @@ def open_csv(where: str, file: io.BufferedReader) -> CsvText:
         delimiter=delimiter,
         decimal=_decimal_mark(rows),
         skipped=header.skipped,
+        head=first,
     )
 
 
@@ -115,12 +123,16 @@ class _Lines(Iterator[str]):
         self.encoding = _find_encoding(file.peek(_START)[:_START])
         self.comments: list[str] = []  # before the first line, the last ones
         self.is_cut = False  # the last line has no end
+        #: for each blank line, how many others were read up to the one behind it
+        self.behind_blank = array("q")
         self.where = where
         self.count = 0  # of the lines that were read
         self._stream = io.TextIOWrapper(file, encoding=self.encoding)
         self._began = False
+        self._others = 0  # lines that are neither blank nor comments
 
     def __next__(self) -> str:
+        blank = 0
         while True:
             line = self._read_line()
             if not line:
@@ -131,7 +143,10 @@ class _Lines(Iterator[str]):
             comment = _COMMENT.match(line)
             if comment is None and line.strip():
                 self._began = True
+                self._others += 1
+                self.behind_blank.extend([self._others - 1] * blank)
                 return line
+            blank += comment is None
             if comment is not None and not self._began:
                 self.comments = [*self.comments[1 - _COMMENTS :], line[comment.end() :]]
 
@@ -154,7 +169,7 @@ class _CsvStream(io.TextIOBase):
     def __init__(self, head: list[str], lines: _Lines, width: int):
         self.lines = lines
         self._width = width  # fields that every row must have; 0 for any
-        self._rows = 0  # that were read
+        self.rows = 0  # that were read
         self._all_lines = chain(head, lines)
         self._unread = ""  # of the line that was read last
 
@@ -180,13 +195,13 @@ class _CsvStream(io.TextIOBase):
 
         A blank cell looks like more space: which column it is of cannot be told.
         """
-        self._rows += 1
+        self.rows += 1
         if not self._width:
             return
         width = len(_split_line(line, WHITE_SPACE))
         if width != self._width:
             raise DataError(
-                f"{self.lines.where}: row {self._rows} has {width} fields, others "
+                f"{self.lines.where}: row {self.rows} has {width} fields, others "
                 f"{self._width}: white space cannot mark an empty cell; separate "
                 "columns by commas"
             )

@@ -1,5 +1,6 @@
 """Reads the YAML text of a mapping; what would take for ever is refused."""
 
+import re
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import yaml
 from gpmpc.exceptions import SettingError
 
 _LONGEST = 2**16  # of a mapping's text [characters]
+_DECIMAL = re.compile(r"[-+]?(0|[1-9][0-9]*)")
 _DEEPEST = 10  # levels of a mapping's text
 
 
@@ -42,7 +44,15 @@ def load_mapping_text(path: str | Path) -> Any:
 
 
 class _UniqueKeys(yaml.SafeLoader):
-    """Reads YAML in which no mapping has a key twice, of which the last would win."""
+    """Reads YAML in which no mapping has a key twice, of which the last would win.
+
+    Only decimal numbers are integers: 0x1A is the name of a message on a CAN bus, and
+    no column by its number.
+    """
+
+    def construct_decimal(self, node: Any) -> int | str:
+        text = str(self.construct_scalar(node))
+        return int(text) if _DECIMAL.fullmatch(text) else text
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         content = super().construct_mapping(node, deep)
@@ -51,6 +61,9 @@ class _UniqueKeys(yaml.SafeLoader):
             key, _ = Counter(keys).most_common(1)[0]
             raise SettingError("mapping", f"holds the key {key!r:.80} twice")
         return content
+
+
+_UniqueKeys.add_constructor("tag:yaml.org,2002:int", _UniqueKeys.construct_decimal)
 
 
 def _check_structure(text: str) -> None:

@@ -7,7 +7,7 @@ import pandas
 import pytest
 
 from gpmpc.exceptions import DataError
-from gpmpc.logs import read_log
+from gpmpc.logs import LogMapping, read_log
 from gpmpc.logs._formats import read_file
 
 MAPPING = {"time": "t", "states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
@@ -124,6 +124,36 @@ def test_what_cannot_be_read_is_refused_by_name(tmp_path, content, reason):
     (tmp_path / "log.csv").write_bytes(content)
     with pytest.raises(DataError, match=rf"log.csv: .*{reason}"):
         read_log(tmp_path / "log.csv", MAPPING)
+
+
+@pytest.mark.parametrize(
+    ("text", "kind", "count"),
+    [
+        (TEXT.replace("\n0.5,", "\n\n\n0.5,"), "blank lines", 2),
+        (TEXT.replace("\n0.0,", "\n\n0.0,", 1) + "\n", "", 0),
+        (
+            TEXT.replace("t,x,u", "note,t,x,u")
+            .replace("\n", "\n,")[:-1]
+            .replace("\n,0.5,", '\n"off,0.5,')
+            .replace("\n,1.0,", '\non again",1.0,'),
+            "lines in quotes",
+            50,
+        ),
+    ],
+)
+def test_lines_that_are_no_rows_are_counted(tmp_path, text, kind, count):
+    (tmp_path / "log.csv").write_text(text)
+    findings = read_log(tmp_path / "log.csv", MAPPING).findings
+    found = [(f.kind, f.count) for f in findings if f.kind != "gap"]
+    assert found == ([(kind, count)] if kind else [])
+
+
+def test_a_column_may_be_called_by_a_hexadecimal_number(tmp_path):
+    text = "time: t\nstates: {x: [0x1A]}\ninputs: {u: [010, 0b1, 10]}\nrate: 10"
+    (tmp_path / "map.yaml").write_text(text)
+    mapping = LogMapping.load(tmp_path / "map.yaml")
+    assert mapping.signal_columns == ("0x1A", "010", "0b1", "10")
+    assert mapping.rate == 10
 
 
 def test_counted_columns_are_no_row(tmp_path):
