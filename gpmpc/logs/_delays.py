@@ -63,13 +63,16 @@ def find_delays(names: Sequence[str], values: Array) -> list[Delay]:
     """Finds the delays of all pairs of channels whose differences are correlated.
 
     Args:
-        names: Of the channels, of which the first ``MOST_CHANNELS`` are compared.
+        names: Of the channels; of those that move, the first ``MOST_CHANNELS`` are
+            compared.
         values: Of the channels (K, c); NaN where a value is missing.
     """
-    length = min(BLOCK_ROWS, len(values) // 8)
-    if length < 4 * LARGEST_LAG:
+    moving = moving_channels(values)[:MOST_CHANNELS]
+    if not len(moving):
         return []
-    steps = _differences(_without_units(values[:, :MOST_CHANNELS]), length)
+    moving_names = [names[channel] for channel in moving.tolist()]
+    length = min(BLOCK_ROWS, len(values) // 8)
+    steps = _differences(_without_units(values[:, moving]), length)
     norms = np.linalg.norm(steps, axis=1)
     usable = np.flatnonzero((norms > 0).all(axis=0))
     size = 1 << int(np.ceil(np.log2(steps.shape[1] + LARGEST_LAG)))
@@ -79,13 +82,22 @@ def find_delays(names: Sequence[str], values: Array) -> list[Delay]:
         correlations = _cross_correlations(spectra, i, size)
         for j in range(correlations.shape[2]):
             delay = _delay_of_pair(
-                channel=names[int(usable[i])],
-                later_channel=names[int(usable[i + 1 + j])],
+                channel=moving_names[int(usable[i])],
+                later_channel=moving_names[int(usable[i + 1 + j])],
                 correlations=correlations[:, :, j],
             )
             if delay is not None:
                 delays.append(delay)
     return delays
+
+
+def moving_channels(values: Array) -> NDArray[np.intp]:
+    """Returns which channels (K, c) change; none where rows are too few for delays."""
+    if min(BLOCK_ROWS, len(values) // 8) < 4 * LARGEST_LAG:
+        return np.empty(0, dtype=np.intp)
+    lowest = np.where(np.isfinite(values), values, np.inf).min(axis=0)
+    highest = np.where(np.isfinite(values), values, -np.inf).max(axis=0)
+    return np.flatnonzero(highest > lowest)
 
 
 def _without_units(values: Array) -> Array:

@@ -30,7 +30,13 @@ from gpmpc.logs._columns import (
     column_number,
     named_columns,
 )
-from gpmpc.logs._delays import MOST_CHANNELS, Delay, delay_table, find_delays
+from gpmpc.logs._delays import (
+    MOST_CHANNELS,
+    Delay,
+    delay_table,
+    find_delays,
+    moving_channels,
+)
 from gpmpc.logs._file import NAMES, Tables
 from gpmpc.logs._findings import Finding
 from gpmpc.logs._formats import read_file
@@ -320,7 +326,7 @@ def _inspect_stream(
         warnings=[
             *_stream_warnings(source.title, clock, steps, times),
             *_time_hints(source, times, constants, numbers),
-            *_warn_of_width(source.title, len(numbers)),
+            *_warn_of_width(source.title, len(moving_channels(values))),
             *_warn_of_names(source),
         ],
         text_columns=[
@@ -336,7 +342,7 @@ def _warn_of_width(title: str, channels: int) -> list[str]:
     of_topic = f" of {title}" if title else ""
     return [
         f"delays are looked for between the first {MOST_CHANNELS} of {channels} "
-        f"channels{of_topic}: a mapping says which channels count"
+        f"channels{of_topic} that move: a mapping says which channels count"
     ]
 
 
