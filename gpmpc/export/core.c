@@ -1727,7 +1727,7 @@ static int end_of_solved(const gpmpc_controller *controller)
         for (e = 0; e < r; e++) {
             real value = row_value(problem, k, e, problem->states[k + 1],
                                    problem->inputs[k]);
-            real rounding = ROUNDING_OF_SUMS * absolute(value);
+            real rounding = GPMPC_ROLLS_OUT ? ROUNDING_OF_SUMS * absolute(value) : 0;
             if (misses[k * r + e] <= KEPT + rounding)
                 continue;
             if (is_hard(e))

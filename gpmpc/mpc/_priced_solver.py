@@ -1,7 +1,8 @@
 """The programs of one step, solved under the prices of their soft rows.
 
 An elastic row that a program cannot keep gets another price than the exact one, which
-later programs of the step keep. ``_elastic`` has the rule.
+later programs of the step keep: but for a first plan's, where they can keep the row.
+``_elastic`` has the rule.
 """
 
 import math
@@ -50,8 +51,12 @@ class PricedSolver:
         self._stopwatch = stopwatch
         self._price_is_due = True  # of elastic rows, by the next program
         self._is_first = True  # whether the next program is the first of the step
+        constraints = prediction.constraints
         #: prices of the rows of a stage (r,); infinite ones are hard
-        self.row_prices = prediction.constraints.prices
+        self.row_prices = constraints.prices
+        # Rows that may get their exact price back, once a step (r,). Along the last
+        # plan none may: there the price was found by rolling the model out.
+        self._may_be_restored = constraints.elastic & (not request.continues_last_plan)
 
     def look_again(self) -> None:
         """Lets the next program price its elastic rows, since a promise was broken.
@@ -87,8 +92,45 @@ class PricedSolver:
             )
             if rows.gives_way.any():
                 solution = self._solve_elastic(program, local, solution, rows)
+        elif self._has_lowered_prices and solution.status.solved:
+            solution = self._restore_prices(program, local, solution)
         self._is_first = False
         return solution
+
+    @property
+    def _has_lowered_prices(self) -> bool:
+        """Whether a row that is not at its exact price may get it back."""
+        is_lowered = self.row_prices < self._prediction.constraints.prices
+        return bool((is_lowered & self._may_be_restored).any())
+
+    def _restore_prices(
+        self, program: CondensedProgram, local: LocalProblem, solution: QPSolution
+    ) -> QPSolution:
+        """Returns the solution with exact prices of rows that these do keep.
+
+        A later program may keep what the first one, linearised along a mere guess,
+        could not.
+        """
+        if self._stopwatch.is_late:
+            return solution
+        exact_prices = self._prediction.constraints.prices
+        is_lowered = self._may_be_restored & (self.row_prices < exact_prices)
+        prices = np.where(is_lowered, exact_prices, self.row_prices)
+        exact_solution = self._solve_at(program, solution, prices)
+        if not exact_solution.status.solved:
+            return solution
+        planned = local.with_solution(program, exact_solution.x, self._request)
+        rows = elastic_rows(
+            planned.row_violations(), planned.row_lengths(), may_give_way=is_lowered
+        )
+        is_kept = is_lowered & ~rows.gives_way
+        if not is_kept.any():
+            return solution
+        self._may_be_restored &= ~is_kept
+        self.row_prices = np.where(is_kept, exact_prices, self.row_prices)
+        if not rows.gives_way.any():
+            return exact_solution
+        return self._solve_at(program, exact_solution, self.row_prices)
 
     def _solve_at(
         self,

@@ -30,7 +30,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
 from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -262,11 +262,8 @@ class GPMPC:
                 decision = self._decide_first(local, request, stopwatch, decision)
             return decision
         except FAILURES as error:
-            status = Status.NUMERICAL_TROUBLE
-            if isinstance(error, FunctionNotFinite):
-                status = Status.FUNCTION_NOT_FINITE
             stopwatch.lap("model")
-            return request.failed_decision(status, timing=stopwatch.timing)
+            return request.failed_decision(_status_of(error), timing=stopwatch.timing)
 
     def _at_what_the_model_does(
         self, local: LocalProblem, request: Request
@@ -522,6 +519,14 @@ class NonlinearGPMPC(GPMPC):
         )
 
 
+class _Ending(NamedTuple):
+    """What a round led to: its plan is the last one where the next round fails."""
+
+    problem: LocalProblem  # with the plan
+    program: CondensedProgram
+    solution: QPSolution
+
+
 class _ControlStep:
     """One decision's programs, from a first guess to a plan that is good enough."""
 
@@ -546,6 +551,7 @@ class _ControlStep:
         )
         self._globalization: Globalization | None = None
         self._squared_lengths: list[float] = []  # of the programs' steps
+        self._ending: _Ending | None = None  # of the rounds before
         self._warm_start: QPSolution | None = None
         if request.last_plan is not None:
             self._warm_start = request.last_plan.solution
@@ -553,13 +559,28 @@ class _ControlStep:
     def run(self, local: LocalProblem) -> Decision:
         """Returns the decision that programs lead to from the problem at a guess.
 
+        Where a later round leaves the numbers of model or solver, the plan of the round
+        before is the last one.
+        """
+        guess = local.plan
+        try:
+            return self._run_rounds(local, guess)
+        except FAILURES as error:
+            if self._ending is None:
+                raise
+            problem, program, solution = self._ending
+            last_problem = self._close_defects(problem, problem, program)
+            return self._conclude(last_problem, guess, solution, _status_of(error))
+
+    def _run_rounds(self, local: LocalProblem, guess: Plan) -> Decision:
+        """Returns the decision of ``run``.
+
         Each round solves the program of ``local`` and takes its step, which leads to
         the next ``local``. The last round is the one whose program fails, whose step
         says so by a status, or behind which a limit allows no other. Its plan is rolled
         out where it may not obey the dynamics. Where that misses a bound by more than
         the program promised, one more round starts at the plan that was rolled out.
         """
-        guess = local.plan
         while True:
             self._stopwatch.lap("model")
             program = self._condense(local)
@@ -574,6 +595,8 @@ class _ControlStep:
             iterate = self._take_step(local, program, solution)
             if iterate.status is None and self._may_go_on:
                 local = iterate.local
+                if local.plan is not guess:
+                    self._ending = _Ending(local, program, solution)
                 continue
             last_problem = self._rolled_out_where_needed(iterate, local, program)
             status = iterate.status
@@ -583,12 +606,12 @@ class _ControlStep:
             if may_be_mended and self._breaks_promise(status, last_problem, solution):
                 if self._may_go_on:
                     # A bound lies elsewhere than the program saw it.
+                    self._ending = _Ending(last_problem, program, solution)
                     plan = last_problem.plan
                     local = self._prediction.linearize(plan, self._request)
                     self._solver.look_again()
                     continue
-                # Who asked for a single program takes the plan as it is.
-                if self._most_programs > 1:
+                if self._takes_plan_back(last_problem):
                     status = None
             if status is None:
                 status = self._limit_reached
@@ -718,6 +741,16 @@ class _ControlStep:
         promised = row_promises.max(axis=0)
         return bool((missed.max(axis=0) > MISS_RATIO * promised + KEPT).any())
 
+    def _takes_plan_back(self, ending: LocalProblem) -> bool:
+        """Returns whether a solved plan that breaks a promise counts as unsolved.
+
+        Who asked for a single program takes the plan as it is. So does who asked for
+        more, where it misses a hard row: unsolved it would not be applied.
+        """
+        if self._most_programs == 1:
+            return False
+        return not self._prediction.misses_hard_rows(ending, FEASIBLE)
+
     def _violation(self, local: LocalProblem) -> float:
         """Returns by how much a plan misses a bound, at most."""
         last_input = self._request.references.previous_input
@@ -800,6 +833,13 @@ def _check_iterations(iterations: int | None, prediction: PredictionSettings) ->
     if iterations > 1 and not prediction.may_iterate:
         rule = f"form {prediction.form!r} is one quadratic program, so 1"
         raise SettingError("iterations", f"{rule}; got {iterations}")
+
+
+def _status_of(error: Exception) -> Status:
+    """Returns how a decision ends whose numbers were not finite."""
+    if isinstance(error, FunctionNotFinite):
+        return Status.FUNCTION_NOT_FINITE
+    return Status.NUMERICAL_TROUBLE
 
 
 def _solution_is_usable(

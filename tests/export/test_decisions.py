@@ -526,3 +526,27 @@ def test_a_plan_that_the_model_contradicts_is_no_guess():
         got = asked.control(belief, origin, wild)
         assert np.abs(got.inputs - motion.inputs).max() < 1e-9
         assert np.abs(got.means - motion.means).max() < 1e-9
+
+
+def test_an_estimate_stays_where_the_model_has_no_numbers():
+    """The last plan began, as was predicted, at a level of less than nothing."""
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u")
+    level = x[0] + 0.2 * (u - casadi.sqrt(x[0]))
+    tank = casadi.Function("f", [x, u], [casadi.vertcat(level, 0.9 * x[1])])
+    model = KnownModel(CasadiFunction(tank), 2, 1)
+    settings = {"covariance": "none", "disturbance_gain": 0.3}
+    controller = gpmpc(Problem(WEIGHTS, TORQUES), model, **settings)
+    compiled = CompiledController(controller, compiler=COMPILER)
+    belief = Gaussian.certain([1.0, 0.0])
+    goal = Reference(np.array([1.2, 0.0]))
+    last = controller.control(belief, goal)
+    means = last.means.copy()
+    means[0, 0] = -0.01
+    last = replace(last, means=means, disturbance=np.array([0.05, 0.0]))
+    expected = controller.control(belief, goal, last)
+    got = compiled.control(belief, goal, last)
+    assert expected.disturbance is not None
+    assert expected.disturbance[0] == 0.05
+    assert got.status is expected.status is Status.SOLVED
+    assert np.abs(got.inputs - expected.inputs).max() < 1e-9

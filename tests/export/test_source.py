@@ -22,11 +22,12 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def controller_of(*constraints):
+def controller_of(*constraints, points=40):
     problem = Problem(
         Tracking([1.0, 0.1], [0.05]), Box([-2.0], [2.0]), constraints=constraints
     )
-    return GPMPC(pendulum_posterior(), Linearization(), problem, 6, [0.0], iterations=1)
+    model = pendulum_posterior(points)
+    return GPMPC(model, Linearization(), problem, 6, [0.0], iterations=1)
 
 
 def test_it_links_to_libm_alone_and_allocates_nothing(tmp_path):
@@ -73,6 +74,21 @@ def test_it_holds_no_part_of_what_the_controller_lacks(tmp_path):
         assert conditions == ["GPMPC_EXPORT"]
     assert "predict_covariances" not in plain.source.read_text()
     assert "predict_covariances" in tube.source.read_text()
+
+
+def test_a_controller_of_a_later_model_keeps_its_ranges(tmp_path):
+    """Where the first model's data were is what its plans are told to be near."""
+    first = controller_of()
+    other = controller_of(points=5)
+    later = first.with_model(other.prediction.model)
+    tables = []
+    for name, exported in (("first", first), ("later", later), ("other", other)):
+        text = export_c(exported, tmp_path / name).source.read_text()
+        table = re.search(r"data_ranges\[.*?\};", text, re.DOTALL)
+        assert table is not None
+        tables.append(table.group())
+    assert tables[1] == tables[0]
+    assert tables[2] != tables[0]
 
 
 def test_two_controllers_of_one_program_have_names(tmp_path):

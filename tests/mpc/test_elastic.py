@@ -177,6 +177,29 @@ def test_a_plan_that_goes_on_pays_a_tenth_for_a_dear_bound():
     assert sums[1] < 0.99 * sums[0]
 
 
+def test_a_plan_that_is_handed_over_is_no_last_one():
+    """Its bound takes the safe price, as a first plan's does."""
+    bound = Box([-np.inf, -np.inf], [0.5, np.inf])
+    problem = Problem(
+        Tracking([1.0, 0.1], [0.01], penalized="inputs"),
+        Box([-8.0], [8.0]),
+        constraints=[bound],
+    )
+    model = LinearGaussian([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]])
+    settings = PredictionSettings(covariance="none")
+    controller = GPMPC(
+        model, Linearization(), problem, H, [0.0], settings, iterations=1
+    )
+    belief = Gaussian.certain(np.array([2.0, 0.0]))
+    origin = Reference(np.zeros(2))
+    first = controller.control(belief, origin)
+    again = controller.control(belief, origin, first)
+    handed_over = controller.control(belief, origin, first, plan=first.inputs)
+    alone = controller.control(belief, origin, plan=first.inputs)
+    np.testing.assert_allclose(handed_over.inputs, alone.inputs, atol=1e-9)
+    assert np.abs(again.inputs - alone.inputs).max() > 1e-3
+
+
 def test_a_reference_beyond_a_bound_does_not_make_it_free():
     """The plan without the bound costs nothing: it rests beyond it."""
     decision = planned("default", [0.8, 0.0], goal=0.8)
@@ -365,8 +388,11 @@ def test_a_solution_stays_where_the_one_of_a_lower_price_fails():
     np.testing.assert_allclose(decision.inputs, exact.inputs, atol=1e-7)
 
 
-def test_each_elastic_row_is_priced_once_a_step():
-    """A row that a later program misses is priced, too; the first keeps its price."""
+def prices_of_rows(starts, is_due):
+    """Prices of place and speed, elastic ones, after programs at several starts.
+
+    Each program is due to price them where ``is_due`` says so.
+    """
     place = Box([-np.inf, -np.inf], [1.0, np.inf], penalty="elastic")
     speed = Box([-np.inf, -np.inf], [np.inf, 0.5], penalty="elastic")
     problem = Problem(
@@ -378,11 +404,10 @@ def test_each_elastic_row_is_priced_once_a_step():
         double_integrator(), Linearization(), problem, horizon=8, initial_input=[0.0]
     )
     prediction = controller.prediction
-    exact_prices = prediction.constraints.prices
     reference = Reference(np.zeros(2))
     solver = None
-    prices = []
-    for start in ([2.0, 0.0], [-3.0, 3.0]):
+    prices = [prediction.constraints.prices]
+    for start, is_program_due in zip(starts, is_due, strict=True):
         request = read_request(prediction, Gaussian.certain(start), reference, None)
         local = prediction.linearize(initial_guess(prediction, request), request)
         program = condense(
@@ -397,13 +422,34 @@ def test_each_elastic_row_is_priced_once_a_step():
             solver = PricedSolver(
                 prediction, DualActiveSet(), request, stopwatch=Stopwatch()
             )
-        solver.look_again()
+        if is_program_due:
+            solver.look_again()
         assert solver.solve(program, local, warm_start=None).status is Status.SOLVED
         prices.append(solver.row_prices)
-    is_lowered = [after < exact_prices for after in prices]
-    assert is_lowered[0].tolist() == [True, False]
-    assert is_lowered[1].tolist() == [True, True]
-    assert prices[1][0] == prices[0][0]
+    return prices
+
+
+def test_each_elastic_row_is_priced_once_a_step():
+    """A row that a later program misses is priced, too; the first keeps its price."""
+    exact, first, second = prices_of_rows(
+        starts=([2.0, 0.0], [-3.0, 3.0]), is_due=(True, True)
+    )
+    assert (first < exact).tolist() == [True, False]
+    assert (second < exact).tolist() == [True, True]
+    assert second[0] == first[0]
+
+
+def test_a_row_that_a_later_program_keeps_gets_its_exact_price_back():
+    """Once: where it is missed after all, it is priced for good."""
+    exact, first, missed, kept, again, last = prices_of_rows(
+        starts=([2.0, 0.0], [2.0, 0.0], [0.9, 0.0], [2.0, 0.0], [0.9, 0.0]),
+        is_due=(True, False, False, True, False),
+    )
+    assert first[0] < exact[0]
+    assert missed[0] == first[0]
+    assert kept[0] == exact[0]
+    assert again[0] < exact[0]
+    assert last[0] == again[0]
 
 
 @pytest.mark.parametrize(

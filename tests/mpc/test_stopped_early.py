@@ -10,6 +10,7 @@ import torch
 
 from gpmpc.experiments.slsqp import SLSQP
 from gpmpc.gaussian import Gaussian
+from gpmpc.models import KnownModel
 from gpmpc.mpc import (
     GPMPC,
     Box,
@@ -174,3 +175,46 @@ def test_a_solver_that_stopped_outside_of_the_bounds_has_no_plan():
     )
     assert decision.status is Status.ITERATION_LIMIT
     assert not decision.applicable
+
+
+def level(penalty, slope_at_edge, **settings):
+    """A decision after a jump towards where the level's root ends, which is at 1.
+
+    The program's plan leads beyond it when it is rolled out: there the model has a mean
+    and, with such a slope at the edge, no derivative.
+    """
+
+    def leak(x, u):
+        above = x - 1.0
+        depth = 0.5 * (above + above.abs()) if slope_at_edge else torch.relu(above)
+        return 0.9 * x + u + torch.sqrt(depth)
+
+    problem = Problem(
+        Tracking([1.0], [0.001], penalized="inputs"),
+        Box([-60.0], [60.0]),
+        constraints=[Box([1.1], [np.inf], penalty=penalty)],
+    )
+    prediction = PredictionSettings(covariance="none", rolled_out=True)
+    model = KnownModel(leak, 1, 1)
+    controller = GPMPC(model, Linearization(), problem, 6, [0.0], prediction)
+    first = controller.control(Gaussian.certain([6.0]), Reference(np.array([6.0])))
+    limited = GPMPC(model, Linearization(), problem, 6, [0.0], prediction, **settings)
+    return limited.control(Gaussian.certain([3.0]), Reference(np.array([1.1])), first)
+
+
+def test_a_plan_stays_where_the_next_program_has_no_numbers():
+    decision = level("elastic", slope_at_edge=True)
+    alone = level("elastic", slope_at_edge=True, iterations=1)
+    assert alone.status is Status.SOFT_BOUND_MISSED
+    assert (decision.applicable, decision.status) == (True, Status.NUMERICAL_TROUBLE)
+    np.testing.assert_allclose(decision.inputs, alone.inputs)
+
+
+def test_a_missed_hard_bound_ends_alike_with_and_without_time_for_more_programs():
+    alone = level(None, slope_at_edge=False, iterations=1)
+    late = level(None, slope_at_edge=False, budget=1e-9)
+    assert alone.violation > 1e-3
+    for decision in (alone, late):
+        assert decision.applicable
+        assert decision.status is Status.HARD_BOUND_MISSED
+    np.testing.assert_allclose(late.inputs, alone.inputs)
