@@ -41,6 +41,12 @@ _WRAPPER = """
         copy(solution.multiplier, multipliers, N + r);
         return solution.status;
     }
+
+    void solve_riccati(const real *A, const real *B, const real *R, real *P, real *K)
+    {
+        real D[GPMPC_INPUTS * GPMPC_INPUTS];
+        riccati(A, B, 0, R, n, P, K, D);
+    }
 """
 
 
@@ -102,3 +108,15 @@ class CompiledPrograms:
         ]
         status = self._code.solve_program(*pointers)
         return Answer(list(Status)[status], x, multipliers)
+
+    def gains(self, A: np.ndarray, B: np.ndarray, R: np.ndarray) -> np.ndarray:
+        """Returns K (variables, rows) of the last stage, whose states weigh 1."""
+        gains = np.full((self.variables, self.rows), np.nan)
+        arrays = [A, B, R, np.eye(self.rows), gains]
+        numbers = [np.ascontiguousarray(array, dtype=float) for array in arrays[:4]]
+        pointers = [
+            array.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
+            for array in [*numbers, gains]
+        ]
+        self._code.solve_riccati(*pointers)
+        return gains

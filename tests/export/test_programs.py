@@ -76,3 +76,13 @@ def test_a_row_at_a_price_contradicts_nothing(compiled, monkeypatch):
     assert proves_infeasibility(*proof)
     assert not proves_infeasibility(*proof, solution.caps)
     assert compiled.solve(problem).status is Status.INFEASIBLE
+
+
+def test_there_is_no_feedback_where_no_gain_can_be_told(compiled):
+    """Where R + B'B, which gains are divided by, is zero or next to it."""
+    n, m = compiled.rows, compiled.variables
+    B = np.ones((n, m))
+    gains = compiled.gains(np.eye(n), B, np.eye(m))
+    expected = np.linalg.solve(np.eye(m) + B.T @ B, B.T)
+    np.testing.assert_allclose(gains, expected, rtol=1e-12)
+    assert (compiled.gains(np.eye(n), B, -B.T @ B) == 0.0).all()
