@@ -50,7 +50,9 @@ class PricedSolver:
         self._request = request
         self._stopwatch = stopwatch
         self._price_is_due = True  # of elastic rows, by the next program
-        self._is_first = True  # whether the next program is the first of the step
+        # Whether the next program is the first of the step, the only one whose prices
+        # are searched by roll-outs.
+        self._is_first = True
         constraints = prediction.constraints
         #: prices of the rows of a stage (r,); infinite ones are hard
         self.row_prices = constraints.prices
