@@ -73,8 +73,8 @@ class _Rows(NamedTuple):
     A: Array  # (r, n), of unit length
     h: Array  # (r,)
     equality: NDArray[np.bool_]  # (r,)
-    stacked: NDArray[np.intp]  # (r,) which stacked constraint [x; Gx] it is,
-    scale: Array  # (r,) and by what that constraint was multiplied
+    stacked: NDArray[np.intp]  # (r,) number of its stacked constraint [x; Gx]
+    scale: Array  # (r,) factor by which that constraint was multiplied
 
 
 class _Outcome(NamedTuple):
