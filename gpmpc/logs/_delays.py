@@ -70,7 +70,7 @@ def find_delays(names: Sequence[str], values: Array) -> list[Delay]:
     moving = moving_channels(values)[:MOST_CHANNELS]
     if not len(moving):
         return []
-    moving_names = [names[channel] for channel in moving.tolist()]
+    moving_names = [names[int(channel)] for channel in moving]
     length = min(BLOCK_ROWS, len(values) // 8)
     steps = _differences(_without_units(values[:, moving]), length)
     norms = np.linalg.norm(steps, axis=1)
