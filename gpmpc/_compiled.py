@@ -17,12 +17,13 @@ written; numba looks at the kernel's own file only. So machine code is loaded on
 module of the package that the kernel's module imports, directly or not, has changed.
 """
 
+import gc
 import hashlib
 import inspect
 import re
 import sys
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache, partial, update_wrapper
 from pathlib import Path
 from threading import Lock
@@ -106,8 +107,8 @@ def inline_njit(function: Callable[P, R]) -> Callable[P, R]:
     A call hands over an array as seven numbers, so that one with a dozen arrays takes
     longer than the work on a few short vectors.
     """
-    options = _options(allocates=False) | _INNER_OPTIONS
-    return register_jitable(**options, forceinline=True)(function)
+    options = _options(allocates=False) | _INNER_OPTIONS | {"forceinline": True}
+    return register_jitable(**options)(function)
 
 
 def _options(allocates: bool) -> dict[str, Any]:
@@ -115,10 +116,29 @@ def _options(allocates: bool) -> dict[str, Any]:
     options: dict[str, Any] = {
         "nogil": True,
         "fastmath": {"reassoc", "contract", "nsz"},
+        # what a function calls would inherit it, and be as many copies of itself
+        "forceinline": False,
     }
     if not allocates:
         options["_nrt"] = False
     return options
+
+
+@contextmanager
+def _without_collections() -> Iterator[None]:
+    """Keeps Python from collecting garbage for as long as a kernel is compiled.
+
+    Each collection walks through all objects of PyTorch and SciPy, and the many of
+    numba cause one after another: a tenth of the time of compilation.
+    """
+    if not gc.isenabled():
+        yield
+        return
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
 
 
 # numba optimises every function that a kernel calls, and makes machine code of it,
@@ -130,10 +150,20 @@ def _options(allocates: bool) -> dict[str, Any]:
 _KERNEL_OPTIONS: dict[str, Any] = {}
 _INNER_OPTIONS: dict[str, Any] = {}
 with suppress(ImportError):
-    from numba.core.codegen import JITCodeLibrary
-    from numba.core.compiler import Compiler
+    from numba.core.codegen import CodeLibrary, JITCodeLibrary
+    from numba.core.compiler import Compiler, Flags
 
-    class _KernelLibrary(JITCodeLibrary):
+    class _Library(JITCodeLibrary):
+        """LLVM's intermediate code of a kernel, or of a part of one."""
+
+        _final_module: Any
+        _linking_libraries: list[CodeLibrary]
+
+        def _optimize_functions(self, ll_module):
+            """Leaves the functions as they are: the kernel is optimised as a whole."""
+            ll_module.data_layout = self._codegen._data_layout
+
+    class _KernelLibrary(_Library):
         """A kernel's machine code, with its own copies of all that it calls.
 
         numba lets the linker take any other copy of the same name: that of another
@@ -141,14 +171,36 @@ with suppress(ImportError):
         own way.
         """
 
+        def finalize(self):
+            """Links what the kernel's parts call too, once each, and optimises all."""
+            libraries = dict.fromkeys(self._linking_libraries)
+            pending = list(libraries)
+            while pending:
+                library = pending.pop()
+                if isinstance(library, _InnerLibrary):
+                    called = [
+                        part
+                        for part in library._linking_libraries
+                        if part not in libraries
+                    ]
+                    libraries.update(dict.fromkeys(called))
+                    pending += called
+            self._linking_libraries = list(libraries)
+            super().finalize()
+
+        def _optimize_final_module(self):
+            """Runs LLVM's passes once; numba runs the cheaper half of them before."""
+            passes, builder = self._codegen._module_pass_manager()
+            passes.run(self._final_module, builder)
+
         def _finalize_final_module(self):
             for function in self._final_module.functions:
                 if function.linkage.name == "linkonce_odr":
                     function.linkage = "internal"
             super()._finalize_final_module()
 
-    class _InnerLibrary(JITCodeLibrary):
-        """LLVM's intermediate code of a part of kernels.
+    class _InnerLibrary(_Library):
+        """LLVM's intermediate code of a part of kernels, without that of what it calls.
 
         It is linked into them, and neither optimised nor assembled before.
         """
@@ -159,19 +211,50 @@ with suppress(ImportError):
 
         codegen: Any = _NoEngine()
 
-        def _optimize_final_module(self):
-            pass
-
-        def _finalize_final_module(self):
+        def finalize(self):
+            """Leaves the rest to the kernel."""
             self._finalize_dynamic_globals()
             self._finalized = True
+
+        def _get_module_for_linking(self):
+            for function in self._final_module.functions:
+                if function.linkage.name == "external" and not function.is_declaration:
+                    function.linkage = "linkonce_odr"
+            return self._final_module
 
         def get_pointer_to_function(self, name):
             """Returns nothing: Python calls the function itself."""
             return 0
 
+    class _Flags(Flags):
+        """Options of a function's compilation, which are equal if its callees' are.
+
+        numba compiles a callee anew for a caller with other options, and looks for it
+        by comparing all of them tens of thousands of times. A callee inherits four.
+        """
+
+        def _inherited(self) -> tuple:
+            return self.nrt, self.forceinline, self.error_model, self.fastmath
+
+        def __eq__(self, other: object) -> bool:
+            return isinstance(other, _Flags) and (
+                self._values == other._values or self._inherited() == other._inherited()
+            )
+
+        def __hash__(self) -> int:
+            return hash(_Flags)
+
     class _KernelCompiler(Compiler):
         library: Any = _KernelLibrary
+
+        def __init__(self, typing, target, library, types, result, flags, names):
+            super().__init__(
+                typing, target, library, types, result, _Flags(flags), names
+            )
+
+        def compile_extra(self, func):
+            with _without_collections():
+                return super().compile_extra(func)
 
         def define_pipelines(self):
             if self.state.library is None:

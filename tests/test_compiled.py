@@ -1,5 +1,6 @@
 """Compiled code is reused until a source that it was compiled from has changed."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -200,11 +201,14 @@ def test_numba_still_has_the_private_parts_that_are_used_here():
 
     Then kernels compile for longer, and edits of other files go unseen.
     """
-    from numba.core.codegen import JITCodeLibrary
-    from numba.core.compiler import Compiler
+    from numba.core.codegen import CPUCodegen, JITCodeLibrary
+    from numba.core.compiler import Compiler, Flags
     from numba.core.cpu import CPUTargetOptions
 
     hooks = (
+        "_optimize_functions",
+        "_get_module_for_linking",
+        "finalize",
         "_optimize_final_module",
         "_finalize_final_module",
         "_finalize_dynamic_globals",
@@ -213,6 +217,10 @@ def test_numba_still_has_the_private_parts_that_are_used_here():
     assert all(callable(getattr(JITCodeLibrary, hook)) for hook in hooks)
     assert isinstance(JITCodeLibrary.codegen, property)
     assert callable(Compiler.define_pipelines)
+    assert callable(Compiler.compile_extra)
+    assert callable(CPUCodegen._module_pass_manager)
+    inherited = {"nrt", "forceinline", "error_model", "fastmath"}
+    assert inherited <= set(Flags.options)
     assert all(
         hasattr(CPUTargetOptions, option)
         for option in ("_nrt", "no_cfunc_wrapper", "no_cpython_wrapper")
@@ -244,6 +252,42 @@ def test_numba_still_has_the_private_parts_that_are_used_here():
         gpmpc._compiled.unchecked_entry_point(kernel)
         is kernel.overloads[kernel.signatures[0]].entry_point
     )
+
+
+def test_a_callee_is_compiled_once_and_no_garbage_collected_meanwhile():
+    """Once for kernels that keep the interpreter's lock and for those that do not."""
+    from numba.core import event
+
+    @gpmpc._compiled.njit_noalloc
+    def callee(x):
+        return 2.0 * x
+
+    def caller(x):
+        return callee(x) + 1.0
+
+    class Passes(event.Listener):
+        """What was lowered, and whether garbage was collected then."""
+
+        def __init__(self):
+            self.lowered = []
+            self.collects = set()
+
+        def on_start(self, event):
+            name = event.data["name"].removesuffix("]")
+            if name.startswith("native_lowering"):
+                self.lowered.append(name.rpartition(".")[2])
+            self.collects.add(gc.isenabled())
+
+        def on_end(self, event):
+            pass
+
+    options = gpmpc._compiled._KERNEL_OPTIONS
+    with event.install_listener("numba:run_pass", Passes()) as passes:
+        for locked in (True, False):
+            assert numba.njit(nogil=not locked, **options)(caller)(1.0) == 3.0
+    assert passes.lowered == ["callee", "caller", "caller"]
+    assert passes.collects == {False}
+    assert gc.isenabled()
 
 
 def test_kernels_compile_without_numbas_private_parts(monkeypatch):
