@@ -217,9 +217,9 @@ class ChangedModel(Wrapper):
 
     def _copy_with(self, **changes: Any) -> "ChangedModel":
         """Copies the model with what it has computed, but for some attributes."""
-        other = object.__new__(type(self))
-        other.__dict__.update(self.__dict__ | changes)
-        return other
+        copied = object.__new__(type(self))
+        copied.__dict__.update(self.__dict__ | changes)
+        return copied
 
     def observe(self, state: Array, input: Array, next_state: Array) -> ObservedChange:
         """Computes what a transition says of the change.
@@ -256,14 +256,14 @@ class ChangedModel(Wrapper):
         it.
         """
         model = self.with_point(step.point, step.observed_change, step.noise_variance)
-        last = model.last_innovation()
+        innovation = model.last_innovation()
         latent = self.latent_left_by_change(
             model_variance=step.latent_variance,
-            change_variance=last.variance - step.noise_variance,
+            change_variance=innovation.variance - step.noise_variance,
             prior_variance=self.signal,
         )
         return Comparison(
-            with_change=Innovation(last.error, last.variance + latent),
+            with_change=Innovation(innovation.error, innovation.variance + latent),
             without_change=Innovation(
                 step.observed_change, step.noise_variance + step.latent_variance
             ),
@@ -298,8 +298,8 @@ class ChangedModel(Wrapper):
             prior_variance: Of d without (k,).
         """
         excess = (model_variance - prior_variance).clip(0.0)
-        left = (change_variance / prior_variance).clip(None, 1.0)
-        return model_variance - excess * (1.0 - left)
+        ratio = (change_variance / prior_variance).clip(None, 1.0)
+        return model_variance - excess * (1.0 - ratio)
 
     @property
     def posterior(self) -> GPPosterior:

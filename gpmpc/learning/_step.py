@@ -51,9 +51,9 @@ def learn_from_step(
     if not (np.abs(observed.value) < _ABSURD * np.sqrt(model.gp_noise)).all():
         return before.after_gap(measured)
     noise_ratios = _with_noise_ratio(before, observed.value)
-    seen = before.with_measurement(measured, observed.value, noise_ratios)
+    learning_state = before.with_measurement(measured, observed.value, noise_ratios)
     if len(noise_ratios) < _FEWEST_RATIOS:
-        return seen.later()
+        return learning_state.later()
     step = LearningStep(
         state=before.state,
         input=input,
@@ -66,21 +66,21 @@ def learn_from_step(
     comparison = model.predict_then_learn(step)
     if before.doubt is not None:
         # It is that of ``seen`` as well, and not None here.
-        return _resolve_doubt(seen, step, comparison, before.doubt)
+        return _resolve_doubt(learning_state, step, comparison, before.doubt)
     innovation = comparison.planned(before.active)
     surprising = innovation.largest_square > model.learning.surprise
     if not surprising and not step.repeats.all():
-        return _accept(seen, comparison)
-    expected = seen.expect(Expectation.certain(before.state, model), step)
-    if surprising or _is_frozen(seen, step, expected):
+        return _accept(learning_state, comparison)
+    expected = learning_state.expect(Expectation.certain(before.state, model), step)
+    if surprising or _is_frozen(learning_state, step, expected):
         return _put_in_doubt(
-            seen,
+            learning_state,
             step,
             comparison,
             expected_if_wrong=expected,
             trusted_noise_ratios=before.noise_ratios,
         )
-    return seen.later()
+    return learning_state.later()
 
 
 def _with_noise_ratio(before: LearningState, observed_change: Array) -> Array:
@@ -241,8 +241,8 @@ def _new_plant(
         observed_change=from_change @ error,
         noise_variance=np.maximum(variance - step.latent_variance, step.noise_variance),
     )
-    alone = model.predict_then_learn(observed)
-    further = alone.with_change.largest_square / surprise
+    comparison = model.predict_then_learn(observed)
+    further = comparison.with_change.largest_square / surprise
     confirmations = 1 + unexplained_steps + int(min(further, _MOST_CONFIRMATIONS))
     tried = False
     if confirmations <= steps_in_doubt <= _LONGEST_BRIDGE:
@@ -253,7 +253,7 @@ def _new_plant(
             notable=surprise,
         )
     return NewPlant(
-        model=alone.model_with_step.later(1.0),
+        model=comparison.model_with_step.later(1.0),
         expected=None,
         confirmations_left=confirmations,
         tried=tried,
