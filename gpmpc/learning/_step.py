@@ -286,7 +286,8 @@ def _acts_like_input(
     coefficients, _, rank, _ = np.linalg.lstsq(effects, errors, rcond=None)
     several = np.count_nonzero(errors**2 > notable) > 1
     remaining = np.linalg.norm(errors - effects @ coefficients)
-    aligned = remaining <= max(_MISALIGNED * np.linalg.norm(errors), deviations)
+    tolerance = max(_MISALIGNED * float(np.linalg.norm(errors)), deviations)
+    aligned = remaining <= tolerance
     return bool(several and aligned and rank < len(errors))
 
 
