@@ -90,7 +90,11 @@ def compiled(
 
 
 def njit_inner(function: Callable[P, R]) -> Callable[P, R]:
-    """Compiles a part of other compiled functions; in Python it stays as it is."""
+    """Compiles a part of other compiled functions; in Python it stays as it is.
+
+    Those are of ``compiled``, or parts themselves: what numba alone compiles would not
+    find what the part calls.
+    """
     options = _options(allocates=True) | _INNER_OPTIONS
     return register_jitable(**options)(function)
 
@@ -116,7 +120,7 @@ def _options(allocates: bool) -> dict[str, Any]:
     options: dict[str, Any] = {
         "nogil": True,
         "fastmath": {"reassoc", "contract", "nsz"},
-        # what a function calls would inherit it, and be as many copies of itself
+        # what a function calls would inherit it, and be compiled once more for each
         "forceinline": False,
     }
     if not allocates:
@@ -227,7 +231,7 @@ with suppress(ImportError):
             return 0
 
     class _Flags(Flags):
-        """Options of a function's compilation, which are equal if its callees' are.
+        """Options of a compilation, equal where callees would inherit the same.
 
         numba compiles a callee anew for a caller with other options, and looks for it
         by comparing all of them tens of thousands of times. A callee inherits four.

@@ -38,6 +38,15 @@ from gpmpc.studies._run_folder import describe_code
 from gpmpc.studies.study import fingerprint
 
 _MODEL = "model.safetensors"
+#: what is written beside it
+_DOCUMENTS = (
+    "report.md",
+    "report.csv",
+    "report.tex",
+    "report.html",
+    "report.png",
+    "card.md",
+)
 _JUDGED_STEPS = (1, 10, 50)  # ahead, besides the longest
 _LONG_TO_READ = 10_000_000  # bytes
 _EXIT_UNUSABLE = 3  # of a model that is written, and should not be used
@@ -130,8 +139,8 @@ def _is_untold(judgement: Judgement) -> bool:
 
 def _save_model(learned: IdentifiedModel, folder: Path) -> None:
     """Saves a model, after the report and the card of an earlier one are gone."""
-    for path in (*folder.glob("report.*"), folder / "card.md"):
-        path.unlink(missing_ok=True)
+    for name in _DOCUMENTS:
+        (folder / name).unlink(missing_ok=True)
     logs.save_learned(learned, folder / _MODEL)
 
 

@@ -52,8 +52,8 @@ expects the plant, with the covariance of that, for two steps at most. After the
 acts on what is measured, with the model as it was learned, until that is explained.
 Where several outputs err in the proportion in which an input acts on them, no single
 sensor is wrong: such a measurement is acted on, and the change that it shows is tried
-until it is confirmed. Steps in doubt may else end the use of a change, and never begin
-it.
+until it is confirmed, or given up. Steps in doubt may else end the use of a change, and
+never begin it.
 
 ``_step`` holds this procedure, ``_changed_model`` the model f + B d, ``_state`` what
 one step hands to the next.

@@ -75,11 +75,11 @@ class LearningController:
 
         known = _belief(learned, belief)
         decision = controller.control(known, reference, previous, **options)
-        if learned.planning is not None and _has_failed(decision):
+        is_as_measured = learned.planning is None and known is belief
+        if _has_failed(decision) and not is_as_measured:
             learning_time += decision.timing.total
             learned = learned.without_change()
-            known = _belief(learned, belief)
-            decision = self.controller.control(known, reference, previous, **options)
+            decision = self.controller.control(belief, reference, previous, **options)
         timing = replace(decision.timing, model=decision.timing.model + learning_time)
         return replace(decision, timing=timing, learned=learned)
 
@@ -118,14 +118,17 @@ def _belief(learned: LearningState, measured: Gaussian) -> Gaussian:
 
     Args:
         learned: From the measurement as well.
-        measured: The measurement.
+        measured: The measurement. Where it is missing, nothing is known: what was
+            expected a step before is not where the plant is now.
     """
     assumed = learned.assumed
-    if assumed is None:
+    if assumed is None or not is_measured(to_array(measured.mean)).all():
         return measured
+    device = measured.mean.device
+    # In double precision, by which the next step tells what was planned from.
     return Gaussian(
-        torch.as_tensor(assumed.mean).to(measured.mean),
-        torch.as_tensor(assumed.covariance).to(measured.mean),
+        torch.as_tensor(assumed.mean, device=device),
+        torch.as_tensor(assumed.covariance, device=device),
         measured.names,
     )
 

@@ -102,7 +102,7 @@ class LearningState:
     """What a flight has taught so far.
 
     Its model's time moves on once a step: every path through ``learn_from_step`` ends
-    in one ``later``, and a ``new_plant`` moves on where it is stored.
+    in one ``later``, and each new plant moves on where it is stored.
     """
 
     model: ChangedModel  #: the model with its change
@@ -197,15 +197,16 @@ class LearningState:
         )
 
     def without_change(self) -> "LearningState":
-        """Returns the state after a decision with the change has failed.
+        """Returns the state after a decision has failed.
 
-        It is not used for this decision. The leads stay: they speak of predictions, and
-        the next decision, elsewhere, may succeed with it.
+        The change is not used for this decision, nor is anything assumed in the place
+        of the measurement. The leads stay: they speak of predictions, and the next
+        decision, elsewhere, may succeed with the change.
         """
         doubt = self.doubt
         if doubt is not None:
             plants = tuple(plant._replace(tried=False) for plant in doubt.new_plants)
-            doubt = doubt._replace(new_plants=plants)
+            doubt = doubt._replace(new_plants=plants, bridged=False)
         return replace(self, active=False, version=self.version + 1, doubt=doubt)
 
     def without_doubt(self, doubt: Doubt) -> "LearningState":

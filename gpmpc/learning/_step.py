@@ -65,7 +65,7 @@ def learn_from_step(
     )
     comparison = model.predict_then_learn(step)
     if before.doubt is not None:
-        # It is that of ``seen`` as well, and not None here.
+        # It is that of ``learning_state`` as well, and not None here.
         return _resolve_doubt(learning_state, step, comparison, before.doubt)
     innovation = comparison.planned(before.active)
     surprising = innovation.largest_square > model.learning.surprise
@@ -225,7 +225,7 @@ def _new_plant(
     Args:
         seen: With the measurement.
         step: That led to it.
-        start: Where the plant was before. The change acts since its derivatives say.
+        start: Where the plant was before; ``by_change`` says since when it is changed.
         unexplained_steps: Each asks for a further confirmation.
         steps_in_doubt: This one included.
     """

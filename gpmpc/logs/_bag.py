@@ -29,7 +29,7 @@ from gpmpc.exceptions import DataError, GpmpcError
 from gpmpc.logs._bag_clocks import choose_times
 from gpmpc.logs._encodings import UnreadError, find_decoder
 from gpmpc.logs._file import (
-    NAMES,
+    LIST_NAMES,
     NUMBER_BYTES,
     STAMP,
     TEXT_BYTES,
@@ -110,9 +110,10 @@ class _TopicTable:
         """
         order = np.argsort(np.array(self.log_times), kind="stable")
         columns = self.arrays()
-        names = columns.get(NAMES)
-        if names is not None and (names == names[0]).all():
-            del columns[NAMES]
+        for path in [path for path in columns if path.endswith(LIST_NAMES)]:
+            names = columns[path]
+            if len(np.unique(names[np.isfinite(names)])) < 2:
+                del columns[path]
         frame = pd.DataFrame({STAMP: times} | columns)
         return frame.iloc[order].reset_index(drop=True)
 

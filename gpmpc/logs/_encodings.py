@@ -5,14 +5,20 @@ Another encoding is entered in ``find_decoder``.
 
 import json
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from mcap.records import Channel, Schema
 
 from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import GpmpcError
-from gpmpc.logs._file import MOST_COLUMNS, NAMES, first_line, needs_extra
+from gpmpc.logs._file import (
+    MOST_COLUMNS,
+    are_names,
+    first_line,
+    names_of_list,
+    needs_extra,
+)
 from gpmpc.logs._ros2 import LISTED, Cells, Decode, ros2_decoder
 from gpmpc.logs._ros_definitions import idl_as_msg
 
@@ -111,7 +117,7 @@ def _collect(
     fields_of: Callable[[Any], _Fields | None],
 ) -> None:
     """Collects the numbers of a message and of those inside it."""
-    lists: list[Sequence[Any]] = []
+    lists: dict[str, Sequence[Any]] = {}
     for name, value in fields_of(message) or ():
         path = f"{prefix}{name}"
         if isinstance(value, bool | int | float):
@@ -122,20 +128,25 @@ def _collect(
             for i, entry in enumerate(value):
                 if isinstance(entry, bool | int | float):
                     cells[f"{path}[{i}]"] = float(entry)
-            lists.append(value)
+            lists[path] = value
         if len(cells) > MOST_COLUMNS:
             raise ValueError(f"it holds more than {MOST_COLUMNS} numbers")
-    names = _names_of_entries(lists)
-    if names:
-        text = repr(names).encode()
-        cells[NAMES] = float(zlib.crc32(text, int(cells.get(NAMES, 0))))
+    _add_names(cells, lists)
 
 
-def _names_of_entries(lists: Sequence[Sequence[Any]]) -> list[list[str]]:
-    """Returns the lists of texts that are as long as a list of numbers beside them."""
-    texts = [[*one] for one in lists if all(isinstance(entry, str) for entry in one)]
-    lengths = {len(one) for one in lists if len(one) and not isinstance(one[0], str)}
-    return [one for one in texts if len(one) in lengths]
+def _add_names(cells: Cells, lists: Mapping[str, Sequence[Any]]) -> None:
+    """Adds checksums of names, for lists of numbers that are as long as the names."""
+    all_names = [
+        [*texts]
+        for path, texts in lists.items()
+        if are_names(path) and all(isinstance(text, str) for text in texts)
+    ]
+    for path in lists:
+        if f"{path}[0]" not in cells:
+            continue
+        names = [one for one in all_names if len(one) == len(lists[path])]
+        if names:
+            cells[names_of_list(path)] = float(zlib.crc32(repr(names).encode()))
 
 
 def _is_short_list(value: Any) -> bool:

@@ -14,14 +14,28 @@ from gpmpc.recording import Flaw
 #: column of the times [s] that a message carries or was logged at; no field of a
 #: message has this name
 STAMP = "(stamp)"
-#: column of a number for each list of texts that messages carry, such as the names of
-#: joints, where these are not the same in all messages
-NAMES = "(names)"
+#: end of the columns of numbers that tell lists of names from each other, such as
+#: "position(names)" of the joints whose positions a message lists; there are some only
+#: where names are not the same in all messages
+LIST_NAMES = "(names)"
 NUMBER_BYTES = 32  # of a number in a table, and of its copies on the way there
 TEXT_BYTES = 64  # of a short text in a table, or of another Python object
 MOST_COLUMNS = 4096  # of a table; with many more, pandas takes seconds for any
 
 Tables = dict[str, pd.DataFrame]  # by topic; "" where a file has a single table
+
+
+def are_names(path: str) -> bool:
+    """Tells whether a list of texts is called as names are, such as ``joint_names``."""
+    return "name" in path.rpartition(".")[2].lower()
+
+
+def names_of_list(path: str) -> str:
+    """Returns the column that tells apart the names of a list's entries.
+
+    ``path`` is that of the list or of an entry: ``position`` or ``position[0]``.
+    """
+    return path.partition("[")[0] + LIST_NAMES
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ from gpmpc.logs._delays import (
     find_delays,
     moving_channels,
 )
-from gpmpc.logs._file import NAMES, Tables
+from gpmpc.logs._file import LIST_NAMES, Tables
 from gpmpc.logs._findings import Finding
 from gpmpc.logs._formats import read_file
 from gpmpc.logs._log import Log
@@ -348,12 +348,14 @@ def _warn_of_width(title: str, channels: int) -> list[str]:
 
 def _warn_of_names(source: _Source) -> list[str]:
     """Says that entries of lists are not the same in all messages of a topic."""
-    if NAMES not in source.table:
+    lists = [name for name in map(str, source.table) if name.endswith(LIST_NAMES)]
+    if not lists:
         return []
-    count = source.table[NAMES].nunique(dropna=False)
+    count = source.table[lists].nunique().max()
+    named = ", ".join(name.removesuffix(LIST_NAMES) for name in lists)
     return [
         f"messages of {source.title} carry {count} different lists of names: entries "
-        "of its lists, [0], [1], ..., are not the same in all of them"
+        f"of {named}, [0], [1], ..., are not the same in all of them"
     ]
 
 
@@ -365,7 +367,11 @@ def _columns_of_interest(
     source: _Source, time_name: str, mapping: LogMapping | None
 ) -> list[Any]:
     """Lists the columns beside the time; with a mapping, those of its signals."""
-    columns = [name for name in source.table if name not in (time_name, NAMES)]
+    columns = [
+        name
+        for name in source.table
+        if name != time_name and not str(name).endswith(LIST_NAMES)
+    ]
     if mapping is None:
         return columns
     signals = [signal for signal in mapping.signals if signal.topic == source.topic]

@@ -10,7 +10,7 @@ import yaml
 from gpmpc.exceptions import SettingError
 
 _LONGEST = 2**16  # of a mapping's text [characters]
-_DECIMAL = re.compile(r"[-+]?(0|[1-9][0-9]*)")
+_NAME_OF_DIGITS = re.compile(r"0[0-9a-zA-Z].*")  # such as 0x1A and 010
 _DEEPEST = 10  # levels of a mapping's text
 
 
@@ -46,13 +46,15 @@ def load_mapping_text(path: str | Path) -> Any:
 class _UniqueKeys(yaml.SafeLoader):
     """Reads YAML in which no mapping has a key twice, of which the last would win.
 
-    Only decimal numbers are integers: 0x1A is the name of a message on a CAN bus, and
-    no column by its number.
+    Digits after a zero are a text: 0x1A is the name of a message on a CAN bus, and no
+    column by its number.
     """
 
-    def construct_decimal(self, node: Any) -> int | str:
+    def construct_number(self, node: Any) -> int | str:
         text = str(self.construct_scalar(node))
-        return int(text) if _DECIMAL.fullmatch(text) else text
+        return (
+            text if _NAME_OF_DIGITS.fullmatch(text) else self.construct_yaml_int(node)
+        )
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         content = super().construct_mapping(node, deep)
@@ -63,7 +65,7 @@ class _UniqueKeys(yaml.SafeLoader):
         return content
 
 
-_UniqueKeys.add_constructor("tag:yaml.org,2002:int", _UniqueKeys.construct_decimal)
+_UniqueKeys.add_constructor("tag:yaml.org,2002:int", _UniqueKeys.construct_number)
 
 
 def _check_structure(text: str) -> None:

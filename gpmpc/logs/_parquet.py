@@ -111,4 +111,5 @@ def _as_frame(content: "pa.Table") -> pd.DataFrame:
     table = content.to_pandas(ignore_metadata=True)
     for name in table.select_dtypes("category"):
         table[name] = table[name].astype(object)
-    return table.rename(columns=_INDEX_NAMES)
+    free = {old: new for old, new in _INDEX_NAMES.items() if new not in table}
+    return table.rename(columns=free)

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from gpmpc._bounds import MemoryBudget
-from gpmpc.logs._file import MOST_COLUMNS, NAMES, TEXT_BYTES
+from gpmpc.logs._file import MOST_COLUMNS, TEXT_BYTES, are_names, names_of_list
 
 LISTED = 64  # entries of a list that become columns, at most
 _STEP = 1024  # of a step of a plan [bytes]
@@ -198,23 +198,23 @@ class _Message:
         self.budget = budget
         self.order = _PLAIN_CDR[kind]
         self.position = 4
-        self.names: dict[int, int] = {}  # checksums of lists of texts, by length
+        self.names: dict[int, int] = {}  # checksums of lists of names, by length
 
     def numbers(self, plan: list[_Step]) -> Cells:
         """Reads all numbers but those of lists of more than ``LISTED`` entries."""
         cells: Cells = {}
-        lengths = set()
+        lengths: dict[str, int] = {}  # of lists of numbers, by path
         for step in plan:
             values = self.values(step)
             if step.is_list:
-                lengths.add(len(values))
+                lengths[step.path] = len(values)
                 for i, value in enumerate(values):
                     cells[f"{step.path}[{i}]"] = float(value)
             elif values:
                 cells[step.path] = float(values[0])
-        names = [self.names[length] for length in sorted(lengths & self.names.keys())]
-        if names:
-            cells[NAMES] = float(sum(names))
+        for path, length in lengths.items():
+            if length in self.names and f"{path}[0]" in cells:
+                cells[names_of_list(path)] = float(self.names[length])
         return cells
 
     def values(self, step: _Step) -> tuple[float, ...]:
@@ -236,7 +236,7 @@ class _Message:
             for _ in range(count):
                 length = self.length()
                 self.scalars("B", length)
-                if step.is_list:
+                if step.is_list and are_names(step.path):
                     text = self.data[self.position - length : self.position]
                     self.names[count] = zlib.crc32(text, self.names.get(count, 0))
             return ()

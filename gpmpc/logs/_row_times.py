@@ -28,14 +28,18 @@ def time_unit(table: pd.DataFrame, column: str) -> str:
 
 
 def usual_time_column(table: pd.DataFrame) -> str:
-    """Finds a column that is called as times are, or holds dates; empty without one."""
+    """Finds a column that is called as times are, or holds dates; empty without one.
+
+    A date that is the same in all rows, as of when the file was made, is no time.
+    """
     for name in TIMES:
         if name in table:
             return name
     for name in map(str, table):
         if unit_in_name(name):
             return name
-    return next((str(name) for name in table if holds_times(table, name)), "")
+    dates = (str(name) for name in table if holds_times(table, name))
+    return next((name for name in dates if table[name].nunique() > 1), "")
 
 
 def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array:
@@ -134,7 +138,7 @@ def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | N
 
 
 def unread_times(table: pd.DataFrame, mapping: LogMapping) -> str:
-    """Returns the column of a table that is called as times are; empty without one.
+    """Returns the time column of a table that no signal reads; empty without one.
 
     One that is a signal, such as t of a temperature, is no time.
     """

@@ -16,7 +16,7 @@ from gpmpc.logs._clocks import (
     find_jumps,
     ordered_stamps,
 )
-from gpmpc.logs._file import NAMES, STAMP, Tables
+from gpmpc.logs._file import STAMP, Tables, names_of_list
 from gpmpc.logs._findings import RunFindings
 from gpmpc.logs._mapping import LogMapping, Signal
 from gpmpc.logs._resampling import (
@@ -133,16 +133,15 @@ def _check_names(where: str, table: pd.DataFrame, signals: Sequence[Signal]) -> 
     Two nodes that publish on one topic, such as the drivers of an arm and of its
     gripper, have joints of their own.
     """
-    if NAMES not in table:
-        return
     entries = [c for signal in signals for c in signal.columns if c.endswith("]")]
-    if entries:
-        raise DataError(
-            f"{where}: its messages carry {table[NAMES].nunique(dropna=False)} "
-            f"different lists of names, so that {entries[0]} is not the same in all of "
-            "them: does more than one node publish on the topic? record a topic for "
-            "each"
-        )
+    for entry in entries:
+        names = names_of_list(entry)
+        if names in table:
+            raise DataError(
+                f"{where}: its messages carry {table[names].nunique()} different lists "
+                f"of names, so that {entry} is not the same in all of them: does more "
+                "than one node publish on the topic? record a topic for each"
+            )
 
 
 def _note_units(

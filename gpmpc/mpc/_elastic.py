@@ -36,7 +36,8 @@ Bounds that the exact price does keep are none of these: theirs stays.
 Rows come in units of their own, and cost in any. So violations count as distances: what
 a row misses over what it rises per unit of distance, its length. Prices here are of
 distances. That of a row is one over its length, its exact price at most: multiplying a
-row by a number, or the whole cost, changes no plan.
+row of a box or a half-space by a number, or the whole cost, changes no plan. (The exact
+prices of other rows take their slopes as 1, which moves the prices that are tried.)
 """
 
 from typing import NamedTuple

@@ -128,11 +128,16 @@ class PricedSolver:
         is_kept = is_lowered & ~rows.gives_way
         if not is_kept.any():
             return solution
+        restored_prices = np.where(is_kept, exact_prices, self.row_prices)
+        if rows.gives_way.any():
+            restored = self._solve_at(program, exact_solution, restored_prices)
+        else:
+            restored = exact_solution
+        if not restored.status.solved:
+            return solution
         self._may_be_restored &= ~is_kept
-        self.row_prices = np.where(is_kept, exact_prices, self.row_prices)
-        if not rows.gives_way.any():
-            return exact_solution
-        return self._solve_at(program, exact_solution, self.row_prices)
+        self.row_prices = restored_prices
+        return restored
 
     def _solve_at(
         self,

@@ -239,7 +239,8 @@ class GPMPC:
         """Returns the decision on a request.
 
         It starts from the problem at the first guess, which is linearised here unless
-        it is handed over. The decision is a failed one where numbers are not finite.
+        it is handed over. The decision is a failed one where numbers are not finite,
+        unless a program before had a plan.
         """
         if not request.finite:
             return request.failed_decision(Status.INVALID_MEASUREMENT)

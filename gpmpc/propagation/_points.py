@@ -13,9 +13,9 @@ Where outputs are angles, whole turns are counted before values are averaged: th
 of 3.1 and -3.1 rad is pi, not 0. An output that is a state, now or a step later, is
 expected to differ from its value at the mean by as much as the point does; any other by
 nothing. Values come within half a turn of what is expected. So a wide belief over an
-angle stays wide, whether the model wraps or not. Values that spread over more than a
-turn, both by themselves and beside what is expected, are wrapped nowhere: these turns
-are real, as of a heading under a wide belief over its rate, and stay.
+angle stays wide, whether the model wraps or not. A model that moves on by a turn where
+its angle does wraps nowhere: its turns are real, as of a heading under a wide belief
+over its rate, and stay.
 
 Monte Carlo: the reference for every other. Its standard error falls as one over the
 root of the number of samples.
@@ -61,7 +61,6 @@ _LEAST_SPREAD = _LEAST_ALPHA**2
 # samples of all beliefs of a batch that are predicted at once: a GP's points' kernels
 # at them are as many times N * outputs numbers, by torch times n + m
 _CHUNK = 1000
-_ROUND_OFF = 1e-6  # of a turn that wrapped angles may spread over
 # part of the points that may lie further than a quarter turn from the first before the
 # log says that turns may be miscounted
 _FAR_POINTS = 0.01
@@ -160,7 +159,9 @@ class Unscented(NoisyPropagator):
             covariance_by_covariance=by_covariance.covariance,
             covariance_by_input=by_covariance.input,
         )
-        moments = self._moments(model, belief, points.steps, expansion.belief)
+        moments = self._moments(
+            model, belief, input, steps=points.steps, predictions=expansion.belief
+        )
         return self._complete_step(model, moments, sensitivity)
 
     def _derivatives(
@@ -236,10 +237,17 @@ class Unscented(NoisyPropagator):
     def _next_moments(self, model: Any, belief: Gaussian, input: Tensor) -> NextMoments:
         points = self._sigma_points(belief, square_root(belief.covariance), input)
         predictions = call("model", model.predict, points.states, points.inputs)
-        return self._moments(model, belief, points.steps, predictions)
+        return self._moments(
+            model, belief, input, steps=points.steps, predictions=predictions
+        )
 
     def _moments(
-        self, model: Any, belief: Gaussian, steps: Tensor, predictions: Gaussian
+        self,
+        model: Any,
+        belief: Gaussian,
+        input: Tensor,
+        steps: Tensor,
+        predictions: Gaussian,
     ) -> NextMoments:
         """Returns the moments of predictions at the points."""
         weights = self._weights(belief.mean, belief.dim)
@@ -248,6 +256,8 @@ class Unscented(NoisyPropagator):
             centre=predictions.mean[..., 0, :],
             steps=steps,
             model=model,
+            belief=belief,
+            input=input,
         )
         mean = weights.mean @ values
         centred = values - mean[..., None, :]
@@ -333,7 +343,14 @@ class MonteCarlo(NoisyPropagator):
         values = torch.cat(means, dim=-2)
         if angles_of(model):
             centre = model.predict(belief.mean, input).mean
-            values = _with_turns(values, centre=centre, steps=steps, model=model)
+            values = _with_turns(
+                values,
+                centre=centre,
+                steps=steps,
+                model=model,
+                belief=belief,
+                input=input,
+            )
         mean = values.mean(-2)
         centred = values - mean[..., None, :]
         sampled = centred.mT @ centred / (self.samples - 1)
@@ -357,7 +374,14 @@ def _repeated(input: Tensor, states: Tensor) -> Tensor:
     return input[..., None, :].expand(*states.shape[:-1], input.shape[-1])
 
 
-def _with_turns(values: Tensor, centre: Tensor, steps: Tensor, model: Any) -> Tensor:
+def _with_turns(
+    values: Tensor,
+    centre: Tensor,
+    steps: Tensor,
+    model: Any,
+    belief: Gaussian,
+    input: Tensor,
+) -> Tensor:
     """Counts the whole turns of outputs that are angles; all others stay.
 
     Args:
@@ -365,6 +389,8 @@ def _with_turns(values: Tensor, centre: Tensor, steps: Tensor, model: Any) -> Te
         centre: Outputs at the belief's mean (*batch, k).
         steps: The points, from the mean (*batch, points, n).
         model: A model of next states, or of measurements.
+        belief: Of the states.
+        input: (*batch, m).
     """
     angles = angles_of(model)
     if not angles:
@@ -375,23 +401,19 @@ def _with_turns(values: Tensor, centre: Tensor, steps: Tensor, model: Any) -> Te
         expected_deviations = torch.zeros_like(deviations)
     else:
         expected_deviations = steps[..., [states[a] for a in angles]]
-    unexpected = deviations - expected_deviations
-    is_counted = _spreads_over_a_turn(deviations) & _spreads_over_a_turn(unexpected)
-    turns = whole_turns(unexpected).masked_fill(is_counted, 0.0)
-    if states is None:
+    turns = whole_turns(deviations - expected_deviations)
+    if states is not None:
+        # Wrapped values are never farther from each other than a turn.
+        two_turns = torch.zeros_like(belief.mean)
+        two_turns[..., [states[a] for a in angles]] = 2 * TURN
+        moved = model.predict(belief.mean + two_turns, input).mean - centre
+        counts_turns = moved[..., angles] > 1.5 * TURN
+        turns = turns.masked_fill(counts_turns[..., None, :], 0.0)
+    else:
         _warn_of_wide_angles(deviations - turns, type(model).__name__)
     counted = values.clone()
     counted[..., angles] = values[..., angles] - turns
     return counted
-
-
-def _spreads_over_a_turn(angles: Tensor) -> Tensor:
-    """Whether angles (*batch, points, a) spread farther than wrapped ones can.
-
-    The answers are (*batch, 1, a).
-    """
-    spread = angles.amax(dim=-2, keepdim=True) - angles.amin(dim=-2, keepdim=True)
-    return spread > TURN * (1 + _ROUND_OFF)
 
 
 def _states_of_outputs(model: Any) -> Sequence[int] | None:

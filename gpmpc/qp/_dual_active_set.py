@@ -79,7 +79,7 @@ class DualActiveSet:
             at between steps, in one of which several constraints may enter or leave.
             Under a time limit it may be passed by up to 50 changes. Guessed constraints
             that enter before the first step, and those that leave because their
-            multipliers are wrong, do not count.
+            multipliers are wrong, do not count, but for doubled digits.
         time_limit: Seconds before ``TIME_LIMIT``; none if omitted.
 
     Raises:

@@ -96,8 +96,9 @@ class QPSolution(NamedTuple):
     def iterations(self) -> int:
         """Changes of the working set, or the iterations of the solver behind.
 
-        Guessed constraints that enter before the first step, and those that leave
-        because their multipliers are wrong, do not count.
+        Of ``DualActiveSet`` guessed constraints that enter before the first step, and
+        those that leave because their multipliers are wrong, do not count, but for
+        doubled digits.
         """
         return int(self.record[layout.ITERATIONS])
 

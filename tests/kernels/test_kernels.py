@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+import gpmpc._compiled
 from gpmpc import _kernels as kernels
 from gpmpc._kernels import _gp_point, _simd, pack
 from gpmpc._kernels._rows import (
@@ -25,6 +26,9 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.propagation._moments import moments, moments_with_jacobian
 from tests.propagation.test_moment_matching import belief, by_mpmath, model
+
+#: as ``compiled``, which alone finds what the parts of kernels call; not cached
+kernel = numba.njit(**gpmpc._compiled._KERNEL_OPTIONS)
 
 
 def packed(gp):
@@ -345,11 +349,11 @@ def test_variances_at_several_points_are_reduced_as_each_alone(size):
     q = np.zeros((8, mine.arrays.points.shape[1]))
     q[:5, :size] = np.random.default_rng(0).normal(size=(5, size))
 
-    @numba.njit
+    @kernel
     def alone(triangle, row):
         return variance_reduction_by_inverse(triangle, row, np.empty_like(row))
 
-    @numba.njit
+    @kernel
     def together(columns, rows, totals):
         add_variance_reductions_by_substitution(columns, len(columns), rows, totals)
 
@@ -443,7 +447,7 @@ def test_not_a_number_is_passed_on():
 def by_lanes(function):
     """A function of Lanes, for arrays of any length."""
 
-    @numba.njit
+    @kernel
     def write(x):
         for j in range(0, len(x), 8):
             store(x, j, function(load(x, j)))
@@ -497,7 +501,7 @@ def test_sizes_over_points_are_the_largest_ones(dims):
     rows[0, 29] = -8.0
     rows[-1, 7] = np.nan
 
-    @numba.njit
+    @kernel
     def sizes(rows):
         return largest_square(rows), largest_size(rows[0])
 
@@ -511,7 +515,7 @@ def test_loops_over_points_may_use_the_widest_registers():
     kernels.linearize_gps(
         gps, np.zeros((1, 2)), np.zeros((1, 1)), False, np.zeros(2), False
     )
-    anew = numba.njit(
+    anew = kernel(
         _gp_point.linearize_points.py_func
     )  # the kernel itself may have been loaded
     x = np.zeros((1, 2))

@@ -435,7 +435,22 @@ class TurningHeading(KnownModel):
         super().__init__(step, state_dim=n, input_dim=0)
 
 
-@pytest.mark.parametrize("make", [silent_heading, WrappedHeading, TurningHeading])
+class KickedHeading(KnownModel):
+    """A user's model that adds to a heading which it has wrapped before."""
+
+    angles = (0,)
+
+    def __init__(self, n):
+        def step(x, u):
+            heading = torch.remainder(x[..., :1] + torch.pi, 2 * torch.pi) - torch.pi
+            return torch.cat([heading + 0.1 * x[..., 1:2], x[..., 1:]], dim=-1)
+
+        super().__init__(step, state_dim=n, input_dim=0)
+
+
+@pytest.mark.parametrize(
+    "make", [silent_heading, WrappedHeading, TurningHeading, KickedHeading]
+)
 @pytest.mark.parametrize("n", [2, 6])
 def test_a_wide_belief_over_an_angle_stays_as_wide(n, make):
     """Points beyond half a turn from the first were folded to the other side."""
