@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from gpmpc.gaussian import Gaussian
 from gpmpc.learning import (
@@ -174,6 +175,23 @@ def test_a_measurement_in_doubt_is_not_acted_on():
         assert np.array_equal(decisions[k].means[0], expected.mean)
         assert np.array_equal(decisions[k].covariances[0], expected.covariance)
     assert decisions[61].learned.doubt is None
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_measurement_that_is_missing_after_a_doubt_is_missing(dtype):
+    sensor = Sensor()
+    sensor.offset[60] = [0.5, 0.0]
+    _, decisions = flown(OnlineLearning(), lambda random: sensor)
+    before, doubted = decisions[59:61]
+    controller = controller_of(OnlineLearning())
+    reference = Reference(torch.as_tensor(SINE[60 : 60 + HORIZON + 1]))
+    shown = torch.as_tensor(doubted.learned.state).to(dtype)
+    again = controller.control(Gaussian.certain(shown), reference, before)
+    assert again.learned.doubt.bridged
+    assert np.array_equal(again.means[0], again.learned.planned_state)
+    nothing = Gaussian.certain(torch.full((2,), torch.nan, dtype=dtype))
+    missed = controller.control(nothing, reference, again)
+    assert missed.status is Status.INVALID_MEASUREMENT
 
 
 @pytest.mark.parametrize("entry", [0, 1])

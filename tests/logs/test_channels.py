@@ -367,12 +367,12 @@ def test_a_rewritten_recording_is_still_a_recording(tmp_path):
     assert 0 < len(file.tables[""]) <= len(expected)
 
 
-def joint_states(encoding):
-    """Returns how two drivers publish joints, their joints and their positions."""
+def joint_states(encoding, field="name"):
+    """Returns how drivers publish joints: texts, in a field, and positions."""
     if encoding == "json":
 
         def encode(names, positions):
-            message = {"name": names, "position": positions}
+            message = {field: names, "position": positions}
             return json.dumps(message).encode()
 
         return strange.Encoder("my/Joints", "json", "jsonschema", b"{}", encode)
@@ -388,38 +388,59 @@ def joint_states(encoding):
         )
         return b"\0\1\0\0" + data
 
-    definition = b"string[] name\nfloat64[] position"
+    definition = f"string[] {field}\nfloat64[] position".encode()
     return strange.Encoder("my/Joints", "cdr", "ros2msg", definition, encode)
+
+
+JOINTS = {
+    "rate": 50,
+    "states": {"q": {"topic": "/joints", "columns": ["position[0]"]}},
+}
+
+
+def write_joints(path, encoder, lists):
+    """Writes a bag whose messages have texts of two lists by turns, at 100 Hz."""
+    with path.open("wb") as file:
+        writer = PlainWriter(file)
+        writer.start()
+        schema = writer.register_schema(
+            encoder.name, encoder.definition, encoder.schema
+        )
+        channel = writer.register_channel("/joints", encoder.message, schema)
+        for k in range(200):
+            names = lists[k % 2]
+            positions = [np.sin(0.1 * k + joint) for joint in range(len(names))]
+            data = encoder.encode(names, positions)
+            time = 10**9 + 10**7 * k
+            writer.add_message(channel, time, data, time, k)
+        writer.finish()
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "json"])
 @pytest.mark.parametrize("others", [["finger"], ["elbow", "shoulder"]])
 def test_joints_of_two_drivers_are_not_one_column(tmp_path, encoding, others):
-    encoder = joint_states(encoding)
     joints = ["shoulder", "elbow"]
-    mapping = {
-        "rate": 50,
-        "states": {"q": {"topic": "/joints", "columns": ["position[0]"]}},
-    }
-    for lists in ([joints, joints], [joints, others]):
-        with (tmp_path / "arm.mcap").open("wb") as file:
-            writer = PlainWriter(file)
-            writer.start()
-            schema = writer.register_schema(
-                encoder.name, encoder.definition, encoder.schema
-            )
-            channel = writer.register_channel("/joints", encoder.message, schema)
-            for k in range(200):
-                names = lists[k % 2]
-                positions = [np.sin(0.1 * k + joint) for joint in range(len(names))]
-                data = encoder.encode(names, positions)
-                time = 10**9 + 10**7 * k
-                writer.add_message(channel, time, data, time, k)
-            writer.finish()
-        if lists[0] is lists[1]:
-            assert len(read_log(tmp_path / "arm.mcap", mapping)) == 100
-            continue
-        with pytest.raises(DataError, match="carry 2 different lists of names"):
-            read_log(tmp_path / "arm.mcap", mapping)
-        warnings = inspect_log(tmp_path / "arm.mcap").warnings
-        assert any("carry 2 different lists of names" in text for text in warnings)
+    write_joints(tmp_path / "arm.mcap", joint_states(encoding), [joints, others])
+    with pytest.raises(DataError, match="carry 2 different lists of names"):
+        read_log(tmp_path / "arm.mcap", JOINTS)
+    warnings = inspect_log(tmp_path / "arm.mcap").warnings
+    assert any("carry 2 different lists of names" in text for text in warnings)
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "json"])
+@pytest.mark.parametrize(
+    ("field", "others"),
+    [
+        ("name", ["shoulder", "elbow"]),
+        ("name", []),  # as a driver begins
+        ("status", ["hot", "cold"]),
+    ],
+)
+def test_joints_of_one_driver_are(tmp_path, encoding, field, others):
+    encoder = joint_states(encoding, field)
+    write_joints(tmp_path / "arm.mcap", encoder, [["shoulder", "elbow"], others])
+    log = read_log(tmp_path / "arm.mcap", JOINTS)
+    assert len(log) == 100
+    assert not any(
+        "names" in text for text in inspect_log(tmp_path / "arm.mcap").warnings
+    )

@@ -299,8 +299,10 @@ def test_a_model_is_the_same_after_saving_and_damage_is_named(tmp_path, caplog):
     # One that should not be used says so, beside no report of another.
     for name in ("report.html", "report.csv", "card.md"):
         (tmp_path / name).write_text("of an earlier model")
+    (tmp_path / "report.pdf").write_text("of the user")
     _save_model(replace(learned, reasons=("no effect of u shows",)), tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["model.safetensors"]
+    files = {path.name for path in tmp_path.iterdir()}
+    assert files == {"model.safetensors", "report.pdf"}
     loaded = load_learned(tmp_path / "model.safetensors")
     assert loaded.reasons == ("no effect of u shows",)
     load_flyable(tmp_path / "model.safetensors")

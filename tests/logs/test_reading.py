@@ -374,6 +374,11 @@ def test_an_index_without_a_name_is_a_column(tmp_path):
         read_log(tmp_path / "log.parquet", {**mapping, "rate": 10})
     inspection = inspect_log(tmp_path / "log.parquet")
     assert inspection.streams.loc[0, "rate [Hz]"] == pytest.approx(50)
+    # Unless another is called so.
+    table["index"] = 0.02 * np.arange(len(table))
+    table.to_parquet(tmp_path / "log.parquet")
+    mapping["time"] = "index"
+    assert read_log(tmp_path / "log.parquet", mapping).time_step == pytest.approx(0.02)
 
 
 def test_a_unit_of_times_is_of_the_column_timestamp(tmp_path):

@@ -316,6 +316,15 @@ def test_rows_of_a_rate_are_not_counted_where_a_column_is_called_as_times_are(
     assert "is called as times are" in warnings
 
 
+def test_the_date_of_a_file_is_no_time_of_its_rows(tmp_path):
+    table = strange.pendulum(ROWS).drop(columns="t")
+    table["made"] = pandas.Timestamp("2024-05-01 12:00")
+    table.to_parquet(tmp_path / "arm.parquet")
+    signals = {key: TABLE_MAPPING[key] for key in ("states", "inputs")}
+    log = read_log(tmp_path / "arm.parquet", {**signals, "rate": 50})
+    assert len(log) == ROWS
+
+
 SIGNALS = {"states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
 
 
