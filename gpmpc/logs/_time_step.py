@@ -22,6 +22,7 @@ FEWEST_STEPS = 10  # of a run whose step is compared
 JITTER = 0.1  # of the time step, from which on a rate should be stated
 SHORT_STEP = 0.5  # time steps; a shorter one is uneven
 LONG_STEP = 1.5  # time steps likewise
+_ROUNDING = 1e-9  # of a step
 _NEXT_MULTIPLE = 1.6  # steps; stamps that are rounded make steps of 2 and of 3 units
 
 
@@ -84,11 +85,13 @@ def _usual_step(steps: Array) -> float:
 
     Unlike a median it is that of the clock where stamps are rounded: at 120 Hz, stamps
     in ms have steps of 8, 8 and 9. A row that came late and the next one, which did
-    not, make a long and a short step, and neither counts.
+    not, make a long and a short step, and neither counts. Where all steps are equal but
+    for rounding it is the median, which other rows do not move by a last digit.
     """
-    median = np.median(steps)
+    median = float(np.median(steps))
     is_usual = (steps >= SHORT_STEP * median) & (steps <= _NEXT_MULTIPLE * median)
-    return float(steps[is_usual].mean())
+    mean = float(steps[is_usual].mean())
+    return median if abs(mean - median) <= _ROUNDING * median else mean
 
 
 def _note_jitter(table: RunTable, step: float, findings: list[Finding]) -> None:
