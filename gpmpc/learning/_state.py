@@ -192,7 +192,7 @@ class LearningState:
             state=state,
             observed_change=observed_change,
             noise_ratios=noise_ratios,
-            # A change that was tried for a step ends.
+            # Another model plans next, where a change was tried for a step.
             version=self.version + self._tries_new_plant,
         )
 

@@ -161,7 +161,7 @@ def _put_in_doubt(
     if not _is_frozen(seen, step, expected_if_wrong):
         starts = [Expectation.certain(step.state, seen.model)]
         if previous_doubt is not None and previous_doubt.bridged:
-            # The change began before this step, or with the first step in doubt.
+            # The change begins with this step, or it began with the first in doubt.
             starts.append(_begun_now(previous_doubt.expected))
             starts.append(previous_doubt.expected)
         new_plants = tuple(

@@ -745,8 +745,8 @@ class _ControlStep:
     def _takes_plan_back(self, ending: LocalProblem) -> bool:
         """Returns whether a solved plan that breaks a promise counts as unsolved.
 
-        Who asked for a single program takes the plan as it is. So does who asked for
-        more, where it misses a hard row: unsolved it would not be applied.
+        Where a single program was asked for, its plan is taken as it is. Where more
+        were, one that misses a hard row is: as unsolved it would not be applied.
         """
         if self._most_programs == 1:
             return False

@@ -177,19 +177,27 @@ def test_a_plan_that_goes_on_pays_a_tenth_for_a_dear_bound():
     assert sums[1] < 0.99 * sums[0]
 
 
-def test_a_plan_that_is_handed_over_is_no_last_one():
-    """Its bound takes the safe price, as a first plan's does."""
-    bound = Box([-np.inf, -np.inf], [0.5, np.inf])
+def controller_beside_a_bound(**options):
+    """A controller of a mass whose place is to stay below an elastic bound."""
     problem = Problem(
         Tracking([1.0, 0.1], [0.01], penalized="inputs"),
         Box([-8.0], [8.0]),
-        constraints=[bound],
+        constraints=[Box([-np.inf, -np.inf], [0.5, np.inf])],
     )
-    model = LinearGaussian([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]])
-    settings = PredictionSettings(covariance="none")
-    controller = GPMPC(
-        model, Linearization(), problem, H, [0.0], settings, iterations=1
+    return GPMPC(
+        model=LinearGaussian([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]]),
+        propagator=Linearization(),
+        problem=problem,
+        horizon=H,
+        initial_input=[0.0],
+        prediction=PredictionSettings(covariance="none"),
+        **options,
     )
+
+
+def test_a_plan_that_is_handed_over_is_no_last_one():
+    """Its bound takes the safe price, as a first plan's does."""
+    controller = controller_beside_a_bound(iterations=1)
     belief = Gaussian.certain(np.array([2.0, 0.0]))
     origin = Reference(np.zeros(2))
     first = controller.control(belief, origin)
@@ -369,17 +377,7 @@ class StopsUnderLowPrices(DualActiveSet):
 
 
 def test_a_solution_stays_where_the_one_of_a_lower_price_fails():
-    bound = Box([-np.inf, -np.inf], [0.5, np.inf])
-    problem = Problem(
-        Tracking([1.0, 0.1], [0.01], penalized="inputs"),
-        Box([-8.0], [8.0]),
-        constraints=[bound],
-    )
-    model = LinearGaussian([[1.0, 0.1], [0.0, 1.0]], [[0.005], [0.1]])
-    prediction = PredictionSettings(covariance="none")
-    controller = GPMPC(
-        model, Linearization(), problem, H, [0.0], prediction, StopsUnderLowPrices()
-    )
+    controller = controller_beside_a_bound(solver=StopsUnderLowPrices())
     decision = controller.control(
         Gaussian.certain(np.array([2.0, 0.0])), Reference(np.zeros(2))
     )
