@@ -102,7 +102,10 @@ class PricedSolver:
     @property
     def _has_lowered_prices(self) -> bool:
         """Whether a row that is not at its exact price may get it back."""
-        is_lowered = self.row_prices < self._prediction.constraints.prices
+        exact_prices = self._prediction.constraints.prices
+        if self.row_prices is exact_prices:
+            return False  # as in nearly every step, and quick
+        is_lowered = self.row_prices < exact_prices
         return bool((is_lowered & self._may_be_restored).any())
 
     def _restore_prices(

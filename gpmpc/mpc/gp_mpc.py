@@ -648,7 +648,8 @@ class _ControlStep:
         """Returns the solution of a program, warm-started from the last one."""
         prices_before = self._solver.row_prices
         solution = self._solver.solve(program, local, self._warm_start)
-        if not np.array_equal(self._solver.row_prices, prices_before):
+        prices = self._solver.row_prices
+        if prices is not prices_before and not np.array_equal(prices, prices_before):
             self._globalization = None  # it weighs by the prices before
         self._programs += 1
         self._warm_start = solution
