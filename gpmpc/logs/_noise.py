@@ -90,11 +90,12 @@ def follow_errors(
         The scaled variances (W, steps, e).
     """
     longest = max(steps) * windows.time_step
+    # From one prediction to the next; pauses between pieces are no part of it.
+    spacing = windows.stride * windows.time_step  # [s]
     scaled = variances.copy()
     for run in np.unique(windows.runs):
         rows = np.flatnonzero(windows.runs == run)
         times = windows.times[rows]
-        spacing = float(times[-1] - times[0]) / max(len(rows) - 1, 1)
         for k, step in enumerate(steps):
             prior_time = max(_PRIOR * step, _LEAST_PRIOR) * windows.time_step  # [s]
             # A prediction that is just over has the age of half a step.

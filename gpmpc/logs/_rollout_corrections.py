@@ -319,6 +319,7 @@ def _stretches_of(windows: Windows) -> np.ndarray:
     np.minimum.at(first_times, runs, windows.times)
     # Of each window, since the first one of its run (W,).
     rows = (windows.times - first_times[runs]) / windows.time_step
+    rows -= _rows_of_pauses(windows)
     lengths = np.zeros(len(first_times))  # of each run, in rows
     np.maximum.at(lengths, runs, rows)
     lengths += windows.ahead
@@ -330,6 +331,21 @@ def _stretches_of(windows: Windows) -> np.ndarray:
     numbers = runs * (_STRETCHES + 1) + stretch_in_run
     # A gap may leave one of them empty: they are numbered anew.
     return np.unique(numbers, return_inverse=True)[1]
+
+
+def _rows_of_pauses(windows: Windows) -> Array:
+    """Counts the time steps (W,) that a run paused for before each of its windows.
+
+    Starts in neighbouring pieces are a past and the steps ahead apart, and a stride.
+    """
+    longest = windows.past + windows.ahead + windows.stride
+    distances = np.diff(windows.times) / windows.time_step
+    is_same_run = np.diff(windows.runs) == 0
+    pauses = np.where(is_same_run, np.maximum(distances - longest, 0.0), 0.0)
+    before = np.concatenate([[0.0], np.cumsum(pauses)])
+    runs = np.unique(windows.runs, return_inverse=True)[1]
+    first = np.flatnonzero(np.r_[True, ~is_same_run])
+    return before - before[first][runs]
 
 
 def _without_chance(shares: Array, errors: Array, regret: _Regret) -> Array:

@@ -416,6 +416,22 @@ def test_a_calm_run_is_soon_known_one_step_ahead(flights):
     np.testing.assert_allclose(scaled[row, 1], far, rtol=0.02)
 
 
+def test_a_run_that_paused_is_followed_as_one_that_begins_anew(flights):
+    (run,) = as_log(flights[:1]).runs
+    half = len(run) // 2
+    pause = np.where(np.arange(len(run)) < half, 0.0, 3600.0)
+    paused = replace(run, time=run.time + pause, begins=(0, half))
+    log = as_log(flights[:1])
+    windows = replace(log, runs=(paused,)).windows(20, 20, 2)
+    alone = replace(log, runs=(run.part(half, len(run), "half"),)).windows(20, 20, 2)
+    errors = np.random.default_rng(0).normal(size=(len(windows), 2, 12))
+    scaled = follow_errors(windows, errors, np.ones_like(errors), (10, 20))
+    expected = follow_errors(
+        alone, errors[-len(alone) :], np.ones((len(alone), 2, 12)), (10, 20)
+    )
+    np.testing.assert_allclose(scaled[-len(alone) :], expected)
+
+
 def test_intervals_are_as_wide_as_errors_where_claims_go_astray(flights):
     windows = as_log(flights[:1]).windows(20, 20, 2)
     rng = np.random.default_rng(0)

@@ -25,6 +25,7 @@ from gpmpc.logs._rollout_corrections import (
     _ROLLOUT,
     Rollouts,
     _Regret,
+    _stretches_of,
     _without_chance,
     choose_averages,
 )
@@ -452,6 +453,18 @@ def test_what_runs_have_each_for_themselves_is_not_corrected():
     common = averages(np.ones((len(windows), 1, 2)))
     np.testing.assert_allclose(common.shares.sum(axis=0), 1.0)
     assert (common.ratios_to_rollout < 0.1).all()
+
+
+def test_a_pause_is_no_stretch():
+    log = log_of(np.zeros((2, 1000, 2)), np.zeros((2, 1000, 1)))
+    runs = [replace(run, begins=(0, 400)) for run in log.runs]
+    whole = replace(log, runs=tuple(runs)).windows(10, past=20)
+    after = np.where(np.arange(1000) < 400, 0.0, 3600.0)
+    runs[0] = replace(runs[0], time=runs[0].time + after)
+    paused = replace(log, runs=tuple(runs)).windows(10, past=20)
+    stretches = _stretches_of(paused)
+    assert stretches.max() == 7
+    np.testing.assert_array_equal(stretches, _stretches_of(whole))
 
 
 def test_a_run_at_rest_does_not_decide_for_those_that_move():
