@@ -51,6 +51,8 @@ class Signals:
             object.__setattr__(self, key, plain_names(names))
         if self.time_step is not None:
             check_number("time_step", self.time_step, above=0, unit="[s]")
+            # files hold no NumPy numbers
+            object.__setattr__(self, "time_step", float(self.time_step))
 
     def check_sizes(self, states: int, inputs: int) -> None:
         """Raises ``ShapeError`` where it names another number of states or inputs."""

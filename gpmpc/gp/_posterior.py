@@ -30,7 +30,7 @@ from gpmpc._dynamics import (
 from gpmpc.exceptions import UnsupportedModel
 from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays
 from gpmpc.gp._backend import check_and_choose_compiled
-from gpmpc.gp._kernel import factorize, kernel_matrix, kernel_of_squares
+from gpmpc.gp._kernel import factorize, kernel_of_squares
 from gpmpc.gp._scaling import Scaling
 from gpmpc.gp._tensor_checks import Predicts, check_gp_tensors
 from gpmpc.signals import UNKNOWN, Signals, check_signals
@@ -80,7 +80,7 @@ class GPPosterior(TensorModel):
     targets: Tensor
     lengthscales: Tensor  #: l (k, n + m), one row an output
     signal_variance: Tensor  #: sf2 (k,)
-    #: sn2 (k,), of the targets; see ``observation_noise`` for the exceptions
+    #: sn2 (k,), of what scatters next states around predictions
     noise_variance: Tensor
     offset: Tensor  #: the prior mean, one constant an output (k,)
     cholesky: Tensor  #: lower factor L of K + sn2 I (k, N, N)
@@ -88,6 +88,11 @@ class GPPosterior(TensorModel):
     input_dim: int  #: m, how many of the last features are certain inputs (controls)
     predicts: Predicts  #: what the targets mean
     signals: Signals = UNKNOWN  #: names and time step of the data, where they are known
+    #: noise variances of ``targets`` (k,). They are ``noise_variance`` until
+    #: ``gpmpc.estimation.separate_noise`` makes that the process' part alone. None of
+    #: pseudo-observations, as of a sparse model: each has a noise of its own,
+    #: correlated with that of others
+    observation_noise: Tensor | None = None
 
     _part = property(lambda self: self.features)
 
@@ -146,16 +151,18 @@ class GPPosterior(TensorModel):
             torch.cholesky_solve(residual, factor)[:, 0]
             for residual, factor in zip(residuals, cholesky, strict=True)
         ]
+        noise_variance = noise_variance.clone()
         return cls(
             features=features.clone(),
             targets=targets.clone(),
             lengthscales=lengthscales.clone(),
             signal_variance=signal_variance.clone(),
-            noise_variance=noise_variance.clone(),
+            noise_variance=noise_variance,
+            observation_noise=noise_variance,
             offset=offset.clone(),
             cholesky=cholesky,
             weights=torch.stack(weights),
-            input_dim=input_dim,
+            input_dim=int(input_dim),  # files hold no NumPy numbers
             predicts=predicts,
             signals=signals,
         )
@@ -167,6 +174,9 @@ class GPPosterior(TensorModel):
             features: The scaling of x~ (n + m,).
             targets: The scaling of the targets (k,).
         """
+        observation_noise = self.observation_noise
+        if observation_noise is not None:
+            observation_noise = observation_noise * targets.factor**2
         return replace(
             self,
             features=features.restore(self.features),
@@ -174,6 +184,7 @@ class GPPosterior(TensorModel):
             lengthscales=self.lengthscales * features.factor,
             signal_variance=self.signal_variance * targets.factor**2,
             noise_variance=self.noise_variance * targets.factor**2,
+            observation_noise=observation_noise,
             offset=targets.restore(self.offset),
             cholesky=self.cholesky * targets.factor[:, None, None],
             weights=self.weights / targets.factor[:, None],
@@ -264,44 +275,6 @@ class GPPosterior(TensorModel):
         return torch.eye(self.state_dim, dtype=self.dtype, device=self.device)
 
     @property
-    def observation_noise(self) -> Tensor | None:
-        """Noise variances of ``targets`` (k,); None of pseudo-observations.
-
-        They are ``noise_variance``, or what the factor holds beyond the kernel where
-        that is the same for all points: after ``gpmpc.estimation.separate_noise``
-        ``noise_variance`` is the process' part alone. Pseudo-observations, as of a
-        sparse model, have a noise of their own each, correlated with that of others.
-        """
-        diagonal = torch.linalg.vector_norm(self.cholesky, dim=-1).square()
-        nominal = (self.signal_variance + self.noise_variance)[:, None]
-        if self._is_round_off(diagonal - nominal):
-            return self.noise_variance
-        # Of the matrix that was factorised the diagonal and the first column are asked.
-        noise = diagonal.mean(-1) - self.signal_variance
-        if len(self) == 1:
-            # a pseudo-observation sums up several rows: its noise is less than theirs
-            return noise if bool((noise > self.noise_variance).all()) else None
-        cross = kernel_matrix(
-            self.features[1:],
-            self.features[:1],
-            lengthscales=self.lengthscales,
-            signal_variance=self.signal_variance,
-        )[..., 0]
-        first_column = self.cholesky[:, 1:, 0] * self.cholesky[:, :1, 0]
-        is_kernel_and_noise = (
-            bool((noise > 0).all())
-            and self._is_round_off(diagonal - diagonal[:, :1])
-            and self._is_round_off(first_column - cross)
-        )
-        return noise if is_kernel_and_noise else None
-
-    def _is_round_off(self, errors: Tensor) -> bool:
-        """Whether errors of K + sn2 I (k, N) are round-off of its diagonal."""
-        diagonal = (self.signal_variance + self.noise_variance)[:, None]
-        round_off = torch.finfo(self.dtype).eps ** 0.75 * diagonal
-        return bool((errors.abs() <= round_off).all())
-
-    @property
     def has_observation_noise(self) -> bool:
         """Whether ``targets`` are observations, with the noise ``observation_noise``.
 
@@ -321,6 +294,9 @@ class GPPosterior(TensorModel):
         def move(tensor: Tensor) -> Tensor:
             return tensor.to(device=device, dtype=dtype)
 
+        observation_noise = self.observation_noise
+        if observation_noise is not None:
+            observation_noise = move(observation_noise)
         return replace(
             self,
             features=move(self.features),
@@ -328,6 +304,7 @@ class GPPosterior(TensorModel):
             lengthscales=move(self.lengthscales),
             signal_variance=move(self.signal_variance),
             noise_variance=move(self.noise_variance),
+            observation_noise=observation_noise,
             offset=move(self.offset),
             cholesky=move(self.cholesky),
             weights=move(self.weights),

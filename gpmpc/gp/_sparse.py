@@ -115,7 +115,7 @@ def sparse_posterior(
         offset=torch.zeros_like(pseudo_targets[0]),
         cholesky=cholesky,
         weights=weights[..., 0],
-        input_dim=input_dim,
+        input_dim=int(input_dim),
         predicts=predicts,
     )
 

@@ -24,6 +24,7 @@ import math
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from gpmpc._calls import explains_arguments
 from gpmpc._files import existing_file, new_file, write_whole
 from gpmpc._provenance import now, versions
 from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
+from gpmpc.gp._kernel import kernel_matrix
 from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._tensor_checks import check_gp_tensors
 from gpmpc.signals import Signals, check_signals
@@ -56,6 +58,9 @@ _POSTERIOR_TENSORS = (
     "cholesky",
     "weights",
 )
+# what the header calls the targets
+_OBSERVATIONS = "observations"
+_PSEUDO_OBSERVATIONS = "pseudo-observations"
 _EXPANSION = 20  # times what a file holds: more than numbers shrink by
 
 
@@ -139,6 +144,11 @@ def posterior_parts(
         "signals": posterior.signals.to_header(),
     }
     tensors = {name: getattr(posterior, name) for name in _POSTERIOR_TENSORS}
+    if posterior.observation_noise is None:
+        header["targets"] = _PSEUDO_OBSERVATIONS
+    else:
+        header["targets"] = _OBSERVATIONS
+        tensors["observation_noise"] = posterior.observation_noise
     posterior_of_parts(path, header, tensors)
     return header, tensors
 
@@ -154,6 +164,9 @@ def posterior_of_parts(
     names = ", ".join(_POSTERIOR_TENSORS)
     with consistent(path, f"not a consistent posterior of {names}"):
         parts = {name: tensors[name] for name in _POSTERIOR_TENSORS}
+        kind_of_targets = header.get("targets")
+        if kind_of_targets == _OBSERVATIONS:
+            parts["observation_noise"] = tensors["observation_noise"]
         predicts = header["predicts"]
         m = header["input_dim"]
         check_gp_tensors(
@@ -163,7 +176,47 @@ def posterior_of_parts(
         signals.check_sizes(parts["features"].shape[1] - m, m)
     if not bool((parts["cholesky"].diagonal(dim1=-2, dim2=-1) > 0).all()):
         raise DataError(f"{path}: the diagonal of cholesky must be positive")
-    return GPPosterior(**parts, input_dim=m, predicts=predicts, signals=signals)
+    posterior = GPPosterior(**parts, input_dim=m, predicts=predicts, signals=signals)
+    if kind_of_targets is not None:
+        return posterior
+    return replace(posterior, observation_noise=_noise_of_factor(posterior))
+
+
+def _noise_of_factor(posterior: GPPosterior) -> Tensor | None:
+    """Reads the observation noise (k,) off a factor; None of pseudo-observations.
+
+    Files of gpmpc 0.2 and before do not say it. Of observations the factor is that of
+    the kernel matrix and one noise: ``noise_variance``, or that before
+    ``separate_noise`` left the process' part there.
+    """
+    signal_variance = posterior.signal_variance
+    diagonal = torch.linalg.vector_norm(posterior.cholesky, dim=-1).square()
+    nominal = (signal_variance + posterior.noise_variance)[:, None]
+    round_off = torch.finfo(posterior.dtype).eps ** 0.75 * nominal
+
+    def is_round_off(errors: Tensor) -> bool:
+        return bool((errors.abs() <= round_off).all())
+
+    if is_round_off(diagonal - nominal):
+        return posterior.noise_variance
+    noise = diagonal.mean(-1) - signal_variance
+    if len(posterior) == 1:
+        # a pseudo-observation sums up several rows: its noise is less than theirs
+        return noise if bool((noise > posterior.noise_variance).all()) else None
+    # Of the matrix that was factorised the diagonal and the first column are asked.
+    cross = kernel_matrix(
+        posterior.features[1:],
+        posterior.features[:1],
+        lengthscales=posterior.lengthscales,
+        signal_variance=signal_variance,
+    )[..., 0]
+    first_column = posterior.cholesky[:, 1:, 0] * posterior.cholesky[:, :1, 0]
+    is_kernel_and_noise = (
+        bool((noise > 0).all())
+        and is_round_off(diagonal - diagonal[:, :1])
+        and is_round_off(first_column - cross)
+    )
+    return noise if is_kernel_and_noise else None
 
 
 @contextmanager

@@ -17,6 +17,8 @@ from gpmpc.gaussian import check_tensors
 Predicts = Literal["next_state", "difference", "value"]
 PREDICTS = ("next_state", "difference", "value")
 
+_POSITIVE = ("lengthscales", "signal_variance", "noise_variance", "observation_noise")
+
 
 def check_gp_tensors(
     features: Tensor,
@@ -76,7 +78,7 @@ def check_gp_tensors(
             )
         _check_finite(name, value)
     check_columns("features", d, k, input_dim, predicts)
-    for name in ("lengthscales", "signal_variance", "noise_variance"):
+    for name in _POSITIVE:
         if name in tensors and not bool((tensors[name] > 0).all()):
             raise SettingError(name, f"must be positive; got {tensors[name].tolist()}")
 

@@ -147,13 +147,12 @@ class Transitions:
 
     def __getitem__(self, rows: slice | Sequence[int]) -> "Transitions":
         """Returns the transitions of some rows, in their order."""
-        if isinstance(rows, str | int | np.integer):
-            rule = "must be whole numbers or a slice; columns are in states and inputs"
-            raise SettingError("rows", f"{rule}; got {rows!r}")
-        if isinstance(rows, slice) and (rows.step or 1) < 0:  # torch takes none
-            rows = list(range(len(self))[rows])
+        indices = _row_indices(rows, len(self))
         return Transitions(
-            self.states[rows], self.inputs[rows], self.next_states[rows], self.signals
+            self.states[indices],
+            self.inputs[indices],
+            self.next_states[indices],
+            self.signals,
         )
 
     def save(self, path: str | Path) -> None:
@@ -244,7 +243,8 @@ class Transitions:
             time_step: Between the two states of a row [s], where it is known.
 
         Raises:
-            SettingError: One name was given where a list of them belongs.
+            SettingError: One name was given where a list of them belongs, or a column
+                stands for two states or inputs.
             DataError: The file or a column is missing, an entry is no finite number, or
                 the next states are named in another order than the states, with
                 affixes of their own each.
@@ -263,6 +263,10 @@ class Transitions:
         for name in inputs:
             if name in states:
                 raise SettingError("inputs", f"must be no states; got {name!r}")
+        if len(set(next_names)) < len(next_names):
+            raise SettingError(
+                "next_states", f"must be different columns; got {', '.join(next_names)}"
+            )
         _check_header(path, header, columns)
         places = {name: header.index(name) for name in columns}
         table = _table(path, lines, places, len(header), least=2 if is_recording else 1)
@@ -280,6 +284,37 @@ class Transitions:
         else:
             after = after[:, order]
         return _from_file(path, x, u, after, signals)
+
+
+def _row_indices(rows: Any, count: int) -> list[int]:
+    """Lists the rows of ``count`` that a slice, whole numbers or a mask choose.
+
+    Raises:
+        SettingError: They are something else, or beyond the rows.
+    """
+    if isinstance(rows, slice):
+        return list(range(count)[rows])
+    values = rows.numpy(force=True) if isinstance(rows, Tensor) else _array(rows)
+    is_mask = values.dtype == bool and values.shape == (count,)
+    if is_mask:
+        return np.flatnonzero(values).tolist()
+    are_indices = values.ndim == 1 and (values.dtype.kind in "iu" or not values.size)
+    indices = values.tolist()
+    if not are_indices or not all(-count <= i < count for i in indices):
+        raise SettingError(
+            "rows",
+            "must be whole numbers or a slice; columns are in states and inputs; "
+            f"got {rows!r:.200} of {count} rows",
+        )
+    return indices
+
+
+def _array(values: Any) -> np.ndarray:
+    """Returns values as an array; of objects where they are none."""
+    try:
+        return np.asarray(values)
+    except ValueError:  # rows of unequal lengths
+        return np.asarray(None)
 
 
 def _check_format(path: Path, header: Any) -> None:

@@ -38,13 +38,22 @@ def residual_model():
 
 
 def as_before(model, path):
-    """Writes a model as gpmpc 1 did: arrays in an .npz archive."""
+    """Writes a model as gpmpc 1 did: arrays in an .npz archive.
+
+    Nothing said whether targets are observations.
+    """
     new = path.with_suffix(".new")
     SAVE[type(model)](model, new)
     header, arrays = _storage._content(new, "model")
     header = {
         key: value
         for key, value in header.items()
-        if key not in ("checksum", "metadata")
+        if key not in ("checksum", "metadata", "targets")
+    }
+    header.get("residual", {}).pop("targets", None)
+    arrays = {
+        name: array
+        for name, array in arrays.items()
+        if not name.endswith("observation_noise")
     }
     path.write_bytes(_storage.write_npz(header | {"format_version": 1}, arrays))

@@ -4,7 +4,7 @@ unnoticed or untold."""
 import json
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -22,7 +22,10 @@ from gpmpc.gp import (
     load_posterior,
     save_posterior,
 )
+from gpmpc.gp._kernel import Hyperparameters
+from gpmpc.gp._sparse import sparse_posterior
 from gpmpc.models import ResidualModel, linearize, save_model
+from gpmpc.signals import Signals
 from tests.gp.small_models import LOAD, SAVE, as_before, posterior, residual_model
 
 
@@ -141,9 +144,57 @@ def test_the_file_is_plain_arrays_and_a_readable_header(tmp_path):
     "make", [posterior, residual_model], ids=["posterior", "residual"]
 )
 def test_a_file_of_the_first_format_is_read(make, tmp_path):
-    as_before(make(), tmp_path / "old.npz")
-    assert_same(LOAD[type(make())](tmp_path / "old.npz"), make())
+    saved = make()
+    as_before(saved, tmp_path / "old.npz")
+    loaded = LOAD[type(saved)](tmp_path / "old.npz")
+    assert_same(loaded, saved)
+    assert getattr(loaded, "residual", loaded).has_observation_noise
     assert load_metadata(tmp_path / "old.npz")["format_version"] == 1
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_targets_are_stays_known(dtype, tmp_path):
+    """Rounded, a factor of great signal says nothing of its noise."""
+    gp = posterior()
+    learned = torch.full((2,), 1e-6, dtype=torch.float64)
+    observed = GPPosterior.from_hyperparameters(
+        gp.features, gp.targets, gp.lengthscales, gp.signal_variance, learned, 1
+    )
+    separated = replace(observed, noise_variance=learned / 2).to(dtype=torch.float32)
+    save_posterior(separated, tmp_path / "gp.safetensors")
+    loaded = load_posterior(tmp_path / "gp.safetensors").to(dtype=dtype)
+    assert torch.allclose(loaded.observation_noise.double(), learned)
+    assert torch.allclose(loaded.noise_variance.double(), learned / 2)
+
+    hyperparameters = Hyperparameters(gp.lengthscales, gp.signal_variance, learned)
+    for points in (1, 12):  # a pseudo-observation of one point is noisier than a row
+        sparse = sparse_posterior(
+            gp.features[:points], gp.features, gp.targets, hyperparameters, input_dim=1
+        ).to(dtype=torch.float32)
+        save_posterior(sparse, tmp_path / "gp.safetensors")
+        loaded = load_posterior(tmp_path / "gp.safetensors").to(dtype=dtype)
+        with pytest.raises(UnsupportedModel, match="pseudo-observations"):
+            Trainer().refit(loaded)
+
+
+def test_dimensions_and_steps_of_numpy_are_kept(tmp_path):
+    gp = posterior()
+    signals = Signals(time_step=np.float32(0.5))
+    saved = GPPosterior.from_hyperparameters(
+        gp.features,
+        gp.targets,
+        gp.lengthscales,
+        gp.signal_variance,
+        gp.noise_variance,
+        input_dim=np.int64(1),
+        signals=signals,
+    )
+    save_posterior(saved, tmp_path / "gp.safetensors")
+    assert_same(load_posterior(tmp_path / "gp.safetensors"), saved)
+    assert load_posterior(tmp_path / "gp.safetensors").signals == signals
+    rows = Transitions(gp.targets, gp.targets, gp.targets, signals)
+    rows.save(tmp_path / "rows.npz")
+    assert Transitions.load(tmp_path / "rows.npz").signals == signals
 
 
 def test_metadata_of_any_keys_are_read_back(tmp_path):

@@ -46,11 +46,25 @@ def test_features_are_states_and_inputs_and_rows_are_chosen(transitions):
     assert torch.equal(transitions.features[:, 3:], transitions.inputs)
     assert torch.equal(transitions[[4, 1]].next_states, transitions.next_states[[4, 1]])
     assert torch.equal(transitions[::-2].inputs, transitions.inputs.flip(0)[::2])
+    assert torch.equal(transitions[(1, 0)].states, transitions.states[[1, 0]])
+    backwards = np.arange(3)[::-1]
+    assert torch.equal(transitions[backwards].states, transitions.states[[2, 1, 0]])
+    assert torch.equal(transitions[np.uint8([1])].states, transitions.states[1:2])
+    is_late = np.arange(len(transitions)) > 1
+    assert torch.equal(transitions[is_late].states, transitions.states[2:])
     assert (len(transitions[:3]), transitions.state_dim, transitions.input_dim) == (
         3,
         3,
         2,
     )
+
+
+@pytest.mark.parametrize(
+    "rows", [(slice(3), slice(1)), [0.5], [99], [[0, 1]], [True], None]
+)
+def test_what_chooses_no_rows_is_refused(transitions, rows):
+    with pytest.raises(SettingError, match="rows: must be whole numbers or a slice"):
+        transitions[rows]
 
 
 @pytest.mark.parametrize(
@@ -232,6 +246,8 @@ def test_next_states_in_another_order_are_refused(tmp_path):
     assert read("after_x", "rate_x") == [[3, 5]]
     with pytest.raises(DataError, match="in the order of the states, .* got v_then,"):
         read("v_then", "after_x")
+    with pytest.raises(SettingError, match="different columns; got after_x, after_x"):
+        read("after_x", "after_x")
 
 
 @pytest.mark.parametrize(
