@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -112,24 +113,66 @@ def _read_run_tables(
     """Reads all files, and makes one table of each run in them."""
     topics = {signal.topic for signal in mapping.signals}
     tables: dict[str, RunTable] = {}  # by run
-    for path in paths:
+    for path, name in zip(paths, _run_names(paths), strict=True):
         file = read_file(path, topics, partial=partial, stamp=mapping.stamp)
-        findings.extend(file.findings)
+        findings_of_file = [*file.findings]
+        findings_of_runs: list[Finding] = []
         budget = MemoryBudget(path)  # of the rows; the reader had one of its own
         named = named_columns(path, file.tables, mapping)
-        for label, tables_of_run in split_into_runs(path, named, mapping, findings):
-            run = f"{run_name(path)}:{label}" if label else run_name(path)
+        runs = split_into_runs(path, named, mapping, findings_of_file)
+        for label, tables_of_run in runs:
+            run = f"{name}:{label}" if label else name
             if run in tables:
                 raise DataError(
                     f"run {run!r} comes from two files: give the files different names"
                 )
             in_file = mapping.run or mapping.runs
             where = f"{path}, run {run}" if in_file else str(path)
-            run_findings = RunFindings(run, findings)
+            run_findings = RunFindings(run, findings_of_runs)
             tables[run] = tabulate(where, tables_of_run, mapping, run_findings, budget)
+        # A reader calls a run by the name of its file alone.
+        findings += [replace(finding, run=name) for finding in findings_of_file]
+        findings += findings_of_runs
     if not tables:
         raise DataError("no log file was given")
     return list(tables.values())
+
+
+def _run_names(paths: Sequence[Path]) -> list[str]:
+    """Returns the names of files without their endings, which are different ones.
+
+    Files of one name have those of their folders before it, as many as tell them
+    apart. In one folder it is their endings that do.
+
+    Raises:
+        DataError: A file is given twice.
+    """
+    files = [path.absolute() for path in paths]
+    files_by_name: dict[str, list[Path]] = {}
+    for file in files:
+        if files.count(file) > 1:
+            raise DataError(f"{file} is given twice")
+        files_by_name.setdefault(run_name(file), []).append(file)
+    names: dict[Path, str] = {}
+    for equal in files_by_name.values():
+        names |= zip(equal, _different_names(equal), strict=True)
+    return [names[file] for file in files]
+
+
+def _different_names(files: Sequence[Path]) -> list[str]:
+    """Returns different names of different files whose own names are equal."""
+    own_names = [run_name(file) for file in files]
+    full_names = [file.name for file in files]
+    folders = [file.parts[-2:0:-1] for file in files]  # the innermost first
+    candidates = (
+        [
+            "/".join((*reversed(parts[:depth]), name))
+            for parts, name in zip(folders, names, strict=True)
+        ]
+        for names in (own_names, full_names)
+        for depth in range(1 + max(map(len, folders)))
+    )
+    return next(names for names in candidates if len(set(names)) == len(files))
 
 
 def _note_unlike_entries(

@@ -109,6 +109,26 @@ def kinds(log):
     return {finding.kind: finding.count for finding in log.findings}
 
 
+@pytest.mark.parametrize(
+    ("files", "names"),
+    [
+        (["a/log.csv", "b/log.csv", "c.csv"], ["a/log", "b/log", "c"]),
+        (["a/1/log.csv", "b/1/log.csv"], ["a/1/log", "b/1/log"]),
+        (["a/log.csv", "a/log.txt"], ["log.csv", "log.txt"]),
+    ],
+)
+def test_files_of_one_name_are_runs_by_their_folders(tmp_path, files, names):
+    for number, name in enumerate(files):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        lines = pendulum_table(seed=number).to_csv(index=False)
+        (tmp_path / name).write_text(f"of this run\n{lines}")
+    log = read_log([tmp_path / name for name in files], PENDULUM)
+    assert [run.name for run in log] == names
+    assert [finding.run for finding in log.findings] == names
+    with pytest.raises(DataError, match="is given twice"):
+        read_log([tmp_path / files[0], tmp_path / files[0]], PENDULUM)
+
+
 def test_no_transition_or_window_goes_over_a_gap(tmp_path):
     table = pendulum_table()
     with_gaps = table.drop(index=[*range(100, 115), 200, *range(301, 303)])
