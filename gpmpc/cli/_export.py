@@ -36,7 +36,12 @@ from gpmpc.export import (
     write_replay,
 )
 from gpmpc.export._checks import check_exportable
-from gpmpc.export._write import check_name
+from gpmpc.export._write import (
+    check_name,
+    check_unwritten,
+    exported_files,
+    is_exported,
+)
 from gpmpc.mpc import GPMPC, Reference
 from gpmpc.recording import Run, read_run
 from gpmpc.studies.flight import Experiment
@@ -52,6 +57,12 @@ def export(arguments: argparse.Namespace) -> Result:
     run = read_run(path)
     experiment = experiment_of_run(run, arguments.trust)
     folder = arguments.to or path.parent / "c"
+    replay = folder / "replay.txt"
+    points = folder / "points.md"
+    written = [*exported_files(folder, arguments.name), replay]
+    if budget is not None or arguments.points is not None:
+        written.append(points)
+    check_unwritten(written, "--to")
     with console.status("learning"):
         controller = _controller_of(run, experiment)
     selection = kept_points(console, controller, experiment, budget, arguments)
@@ -67,10 +78,8 @@ def export(arguments: argparse.Namespace) -> Result:
             points=selection.points,
             name=arguments.name,
         )
-        steps = write_replay(
-            selection.controller, questions, folder / "replay.txt", policy
-        )
-        _write_points(folder / "points.md", selection, arguments.budget)
+        steps = write_replay(selection.controller, questions, replay, policy)
+        _write_points(points, selection, arguments.budget)
     header, source = (f"src/{file.name}" for file in export)
     lines = [f"written to {folder}: {header}, {source}, and a replay of {steps} steps"]
     lines += selection.lines
@@ -105,9 +114,10 @@ def export(arguments: argparse.Namespace) -> Result:
 
 
 def _write_points(path: Path, selection: KeptPoints, budget: str) -> None:
-    """Writes how many points are kept; an older page goes where all are."""
+    """Writes how many points are kept; where all are, an older export's page goes."""
     if selection.points is None:
-        path.unlink(missing_ok=True)
+        if is_exported(path):
+            path.unlink()
     else:
         write_whole(path, selection.document(budget))
 

@@ -15,6 +15,7 @@ from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import SettingError, check_number
 from gpmpc.export import Budget, PointChoice, choose_points, with_points
 from gpmpc.export._points import posterior_of
+from gpmpc.export._write import MARK
 from gpmpc.mpc import GPMPC
 from gpmpc.simulation import Rollout
 from gpmpc.studies.flight import Experiment, run_trial
@@ -73,7 +74,8 @@ class KeptPoints(NamedTuple):
 
     def document(self, budget: str) -> str:
         """Returns the page of the exported folder that says how many are kept."""
-        text = f"# Points\n\n{self.points} of {self.all_points} points are kept"
+        text = f"<!-- {MARK} -->\n\n# Points\n\n"
+        text += f"{self.points} of {self.all_points} points are kept"
         if self.choice is None:
             return f"{text}.\n"
         return (

@@ -12,6 +12,9 @@ _LOG2_E = 1.0 / np.log(2.0)
 # bits of a sum of squares that are left for u: beyond, whole numbers do not reach
 _LEAST_BITS = 9
 _MOST_BITS = 60
+# Of the magnitudes of weights: a smaller one is none, as of an output whose targets are
+# all its prior mean. Its unit, and a whole number's part of that, would be infinite.
+_LEAST_SUM = 2.0**64 * np.finfo(float).tiny
 # Rounding of a mean and of a slope, as shares of the means' range over the points, and
 # of that over the range of a feature. Beyond, an input may miss 1e-4 of its range: it
 # did by 9e-4, under a light weight, with means of 2e-5 and slopes of 7e-4.
@@ -49,8 +52,9 @@ def fixed_point(gp: GPPosterior) -> FixedPoint | None:
         return None
     if not _is_exact_enough(gp, reach):
         return None
-    total = np.maximum(np.abs(beta).sum(axis=1), np.finfo(float).tiny)
-    weight_unit = (2.0**31 - 1 - 2 * size) / total
+    magnitudes = np.abs(beta).sum(axis=1)
+    magnitudes = np.where(magnitudes > _LEAST_SUM, magnitudes, 1.0)
+    weight_unit = (2.0**31 - 1 - 2 * size) / magnitudes
     scaled = beta * weight_unit[:, None]
     weights = np.floor(scaled)
     return FixedPoint(

@@ -12,6 +12,7 @@ from gpmpc.export._checks import check_kappas
 from gpmpc.export._filter import Estimator, check_estimator
 from gpmpc.export._functions import FunctionWriter, parameter_rows
 from gpmpc.export._text import Numbers
+from gpmpc.export._write import MARK, check_unwritten
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import GPMPC, ControlLoop, Reference
 from gpmpc.mpc._policy import OnFailure
@@ -86,7 +87,7 @@ def write_replay(
     Args:
         controller: Which was exported.
         questions: Of a flight, step by step.
-        path: The file.
+        path: The file, which goes over an older replay.
         on_failure: The policy that was exported.
         estimator: The filter that was exported.
 
@@ -95,15 +96,17 @@ def write_replay(
 
     Raises:
         ShapeError: Parameters of another number than the controller takes.
-        SettingError: A reference with kappas, which exported code does not take.
+        SettingError: A reference with kappas, which exported code does not take. Or
+            the file is one of somebody else.
     """
+    check_unwritten([Path(path)])
     count = FunctionWriter(controller, Numbers("double")).parameters
     lines = []
     for answer in answers(controller, questions, on_failure, estimator):
         numbers = np.concatenate(_numbers_of(answer, controller.horizon, count))
         text = " ".join(repr(float(number)) for number in numbers)
         lines.append(f"{text} {_STATUSES.index(answer.status)}")
-    write_whole(path, "\n".join(lines) + "\n")
+    write_whole(path, "\n".join([f"# {MARK}", *lines]) + "\n")
     return len(lines)
 
 

@@ -2,7 +2,7 @@
 
 import re
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,8 +28,8 @@ from gpmpc.mpc import GPMPC
 
 _HERE = Path(__file__).parent
 _NAME = "gpmpc"
-# in every file that is written, and in no other
-_MARK = "Written by gpmpc"
+#: In every file that is written, and in no other.
+MARK = "Written by gpmpc; the next export overwrites it."
 _PREFIX = re.compile(r"(?<![A-Za-z])gpmpc(?=_|\.[ch]\b)")
 # a header of such a name, or a target of such a name, would hide another one
 _TAKEN = frozenset(
@@ -100,8 +100,7 @@ def export_c(
     """
     check_name(name)
     folder = Path(path)
-    around = {folder / place: template for place, template in _AROUND.items()}
-    _check_unwritten([*_sources(folder / "src", name), *around])
+    check_unwritten(exported_files(folder, name))
     notes: list[str] = []
     if points is not None:
         check_exportable(controller, on_failure)
@@ -111,7 +110,8 @@ def export_c(
     export = write_code(
         controller, folder / "src", precision, on_failure, estimator, notes, name
     )
-    for file, template in around.items():
+    for place, template in _AROUND.items():
+        file = folder / place
         text = (_HERE / "around" / template).read_text()
         file.parent.mkdir(parents=True, exist_ok=True)
         write_whole(file, _renamed(text, name).replace("@name@", name))
@@ -127,12 +127,23 @@ def check_name(name: str) -> None:
         raise SettingError("name", f"{name} is the name of another file or target")
 
 
-def _check_unwritten(files: Sequence[Path]) -> None:
+def exported_files(folder: Path, name: str) -> list[Path]:
+    """Returns the files that ``export_c`` writes into a folder."""
+    around = [folder / place for place in _AROUND]
+    return [*_sources(folder / "src", name), *around]
+
+
+def check_unwritten(files: Iterable[Path], key: str = "path") -> None:
     """Raises ``SettingError`` where a file exists that an export did not write."""
     for file in files:
-        if file.is_file() and _MARK not in file.read_text(errors="replace"):
-            rule = f"{file} was not written by an export; name another folder"
-            raise SettingError("path", rule)
+        if file.exists() and not is_exported(file):
+            rule = "was not written by an export, or by one of an older version"
+            raise SettingError(key, f"{file} {rule}; name another folder")
+
+
+def is_exported(file: Path) -> bool:
+    """Whether a file is one that an export wrote."""
+    return file.is_file() and MARK in file.read_text(errors="replace")
 
 
 def _sources(folder: Path, name: str) -> tuple[Path, Path]:
@@ -322,6 +333,6 @@ def _names(controller: GPMPC, estimator: Estimator | None) -> list[str]:
 
 def _banner(title: str, names: list[str]) -> str:
     """Returns the comment that a file begins with."""
-    lines = [title, f"{_MARK}; the next export overwrites it.", "", *names]
+    lines = [title, MARK, "", *names]
     body = "\n   ".join(comment(line) for line in lines)
     return f"/* {body} */\n".replace("\n   \n", "\n\n")

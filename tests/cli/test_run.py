@@ -14,6 +14,7 @@ from gpmpc import _provenance
 from gpmpc._provenance import code_fingerprint
 from gpmpc.cli import _calibrate, _export, _recorded, _run
 from gpmpc.cli._plain_settings import plain_settings
+from gpmpc.exceptions import SettingError
 from gpmpc.plotting._recorded import expected
 from gpmpc.recording import read_run
 from tests.cli.command import forked, gpmpc
@@ -115,7 +116,15 @@ def test_a_flight_is_predicted_or_one_line_says_why_not(tmp_path, monkeypatch, c
     monkeypatch.setattr(shutil, "which", lambda name: None)
     arguments |= {"precision": "double", "points": None}
     arguments |= {"budget": None, "chip": None, "name": "gpmpc"}
-    exported = _export.export(argparse.Namespace(**arguments))
+    own = tmp_path / "notes"
+    own.mkdir()
+    (own / "points.md").write_text("mine")
+    exported = _export.export(argparse.Namespace(**arguments | {"to": own}))
+    for changed, said in ({"points": 9}, "points.md"), ({}, "replay.txt"):
+        (own / said).write_text("mine")
+        with pytest.raises(SettingError, match=f"{said} was not written by an export"):
+            _export.export(argparse.Namespace(**arguments | {"to": own} | changed))
+        assert (own / said).read_text() == "mine"
     assert 0 <= exported.data["difference_from_flight"] < 1e-6
     said = "was flown by other code: what is exported is what this code makes of"
     assert said in capsys.readouterr().out

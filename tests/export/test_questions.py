@@ -90,6 +90,27 @@ def test_what_code_does_not_take_is_refused():
     assert np.isfinite(loop.input(state, state)).all()
 
 
+def test_an_output_that_rests_is_exported_in_float():
+    """A state that stood still in all rows has GPs of weights zero."""
+    states = torch.tensor([[-1.0, 0.5], [0.0, -0.5], [1.0, 0.0]], dtype=torch.float64)
+    inputs = torch.tensor([[1.0], [-1.0], [0.5]], dtype=torch.float64)
+    gp = GPPosterior.from_hyperparameters(
+        torch.cat([states, inputs], dim=1),
+        torch.cat([0.1 * states[:, 1:] + 0.1 * inputs, torch.zeros(3, 1)], dim=1),
+        lengthscales=torch.full((2, 3), 2.0),
+        signal_variance=torch.ones(2),
+        noise_variance=torch.full((2,), 1e-4),
+        input_dim=1,
+        predicts="difference",
+    )
+    controller = controller_of(gp)
+    loop = CompiledLoop(controller, "float", compiler=COMPILER)
+    (answer,) = answers(controller, [Question(np.ones(2), Reference(np.zeros(2)))])
+    got = loop.input(np.ones(2), np.zeros(2))
+    assert abs(got - answer.input).max() < 1e-3
+    assert abs(got).max() > 0.1
+
+
 def test_numbers_beyond_a_float_and_undefined_ones_are_c():
     single = Numbers("float")
     assert [single.number(x) for x in (1e40, -1e40, np.nan)] == [
@@ -111,8 +132,21 @@ def test_a_replay_without_reference_inputs_begins_as_python(tmp_path):
     sources = ["examples/replay/replay.c", "src/gpmpc.c"]
     command = ["cc", "-std=c99", "-Isrc", *sources, "-lm", "-o", "replay"]
     subprocess.run(command, cwd=tmp_path, check=True)
-    done = subprocess.run(
-        ["./replay", "replay.txt"], cwd=tmp_path, capture_output=True, text=True
-    )
+
+    def replayed():
+        return subprocess.run(
+            ["./replay"], cwd=tmp_path, capture_output=True, text=True
+        )
+
+    done = replayed()
     deviation = done.stdout.split("largest deviation ")[1].partition(",")[0]
     assert float(deviation) < 1e-9
+    assert done.returncode == 0
+    # what differs from Python's, and what is no replay, is told by the exit code
+    written = (tmp_path / "replay.txt").read_text()
+    *numbers, status = written.split()
+    other = " ".join([*numbers[:-1], str(float(numbers[-1]) + 0.01), status])
+    comment = written.splitlines()[0]
+    for text, code in ((f"{comment}\n{other[len(comment) :]}", 1), (comment, 2)):
+        (tmp_path / "replay.txt").write_text(text)
+        assert replayed().returncode == code

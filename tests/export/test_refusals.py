@@ -5,9 +5,16 @@ import pytest
 import torch
 
 from gpmpc.exceptions import SettingError
-from gpmpc.export import export_c
+from gpmpc.export import Question, export_c, write_replay
 from gpmpc.models import DelayedModel
-from gpmpc.mpc import GPMPC, Inequality, PredictionSettings, Problem, Tracking
+from gpmpc.mpc import (
+    GPMPC,
+    Inequality,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+)
 from gpmpc.mpc.baselines import LQR
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.qp import DualActiveSet, PrimalActiveSet
@@ -93,6 +100,14 @@ def test_a_file_of_somebody_else_stays(tmp_path):
     assert (tmp_path / "Makefile").read_text() == "all:\n"
     for _ in range(2):  # the second goes over the first
         export_c(gpmpc(), tmp_path / "own")
+    replay = tmp_path / "own/replay.txt"
+    asked = [Question(np.zeros(2), Reference(np.zeros(2)))]
+    for _ in range(2):
+        write_replay(gpmpc(), asked, replay)
+    replay.write_text("0.0 1.0\n")
+    with pytest.raises(SettingError, match="replay.txt was not written by an export"):
+        write_replay(gpmpc(), asked, replay)
+    assert replay.read_text() == "0.0 1.0\n"
 
 
 def test_numbers_are_read_back_to_the_same_bits(tmp_path):
