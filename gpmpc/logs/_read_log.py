@@ -67,6 +67,7 @@ def read_log(
     mapping = with_axes_of_files(_as_mapping(mapping), paths)
     findings: list[Finding] = []
     tables = _read_run_tables(paths, mapping, partial, findings)
+    _check_common_rows(paths[0], tables, mapping)
     step = find_time_step(tables, paths[0], mapping, findings)
     rest_ranges = least_motion(
         [mapping.split(table.values).states for table in tables], step
@@ -173,6 +174,35 @@ def _different_names(files: Sequence[Path]) -> list[str]:
         for depth in range(1 + max(map(len, folders)))
     )
     return next(names for names in candidates if len(set(names)) == len(files))
+
+
+def _check_common_rows(
+    first_path: Path, tables: Sequence[RunTable], mapping: LogMapping
+) -> None:
+    """Raises ``DataError`` where no row has a value of every signal.
+
+    So it is where each stream has rows of its own, or one has longer gaps.
+    """
+    has_value = ~np.isnan(np.concatenate([table.values for table in tables]))
+    if has_value.all(axis=1).any():
+        return
+    counts: dict[str, int] = {}  # of rows with a value, by signal
+    first = 0
+    for signal in mapping.signals:
+        behind = first + len(signal.group.entries)
+        counts[signal.name] = int(has_value[:, first:behind].all(axis=1).sum())
+        first = behind
+    if mapping.rate:
+        remedy = "state a longer max_gap, over which values are carried"
+    elif all(counts.values()):
+        remedy = "state a rate (rate: 50), which brings the signals to common rows"
+    else:
+        remedy = "name columns that hold values"
+    listed = ", ".join(f"{name} in {count}" for name, count in counts.items())
+    raise DataError(
+        f"{first_path}: no row has a value of every signal: of {len(has_value)} rows, "
+        f"{listed}; {remedy}"
+    )
 
 
 def _note_unlike_entries(

@@ -177,6 +177,17 @@ class Samples(NamedTuple):
     time: Array  # (K,) [s]
     values: Array  # (K, c); those with a NaN are no samples
 
+    @property
+    def present(self) -> np.ndarray:
+        """The rows (K,) that are samples."""
+        return np.asarray(np.isfinite(self.values).all(axis=1))
+
+    @property
+    def usual_step(self) -> float:
+        """The median time between samples [s]; zero where there are less than two."""
+        steps = np.diff(self.time[self.present])
+        return float(np.median(steps)) if len(steps) else 0.0
+
     def column(self, index: int) -> "Samples":
         """Returns the samples of one column."""
         return Samples(self.time, self.values[:, index : index + 1])
@@ -196,15 +207,14 @@ class Interpolation(NamedTuple):
 
 def resample(samples: Samples, grid: Array, interpolation: Interpolation) -> Array:
     """Computes values (G, c) at the times of a grid (G,) [s] from samples."""
-    present = np.isfinite(samples.values).all(axis=1)
+    present = samples.present
     time = samples.time[present]
     values = samples.values[present]
     if not len(time):
         return np.full((len(grid), values.shape[1]), np.nan)
     resolution = STAMP_RESOLUTION
     if len(time) > 1:
-        usual_step = float(np.median(np.diff(time)))
-        resolution = min(resolution, FINE_RESOLUTION * usual_step)
+        resolution = min(resolution, FINE_RESOLUTION * samples.usual_step)
     sample = np.searchsorted(time, grid + resolution, side="right") - 1
     before = np.clip(sample, 0, None)
     after = np.clip(sample + 1, None, len(time) - 1)

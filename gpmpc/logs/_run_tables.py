@@ -16,6 +16,7 @@ from gpmpc.logs._clocks import (
     find_jumps,
     ordered_stamps,
 )
+from gpmpc.logs._equal_stamps import TimedRows, merge_rows
 from gpmpc.logs._file import STAMP, Tables, names_of_list
 from gpmpc.logs._findings import RunFindings
 from gpmpc.logs._mapping import LogMapping, Signal
@@ -116,9 +117,12 @@ def _read_topic(
         findings.add("no stamp", count, f"{count} rows without a time: left out")
         table = table[has_time]
         times = times[has_time]
-    stamps = ordered_stamps(times, where, hint)
     signals = [signal for signal in mapping.signals if signal.topic == topic]
     _check_names(where, table, signals)
+    columns = [column for signal in signals for column in signal.columns]
+    rows = TimedRows(table, times)
+    table, times = merge_rows(rows, [*columns, *mapping.keep], findings)
+    stamps = ordered_stamps(times, where, hint)
     ordered = table.iloc[stamps.rows]
     measured = ordered
     if any((signal.held or mapping.held) != "use" for signal in signals):
@@ -276,8 +280,7 @@ def _signal_on_grid(
     """Resamples a signal to the rows of a grid (G, c), if there is need."""
     if mapping.rate is None and not any(signal.delays):
         return samples.values  # the rows of the grid are those of the table
-    steps = np.diff(samples.time)
-    usual_step = float(np.median(steps)) if len(steps) else 0.0
+    usual_step = samples.usual_step
     if mapping.rate is not None:
         usual_step = max(usual_step, 1 / mapping.rate)
     interpolation = Interpolation(
@@ -303,11 +306,9 @@ def _note_own_rate(
     findings: RunFindings,
 ) -> None:
     """Notes a state that is measured less often than rows are made of it."""
-    present = np.isfinite(samples.values).all(axis=1)
-    steps = np.diff(samples.time[present])
-    if mapping.rate is None or signal.role != "states" or not len(steps):
+    if mapping.rate is None or signal.role != "states":
         return
-    own_step = float(np.median(steps))
+    own_step = samples.usual_step
     if own_step * mapping.rate < USUAL_GAP or signal.rule == "hold":
         return
     interpolated = 1 - 1 / (own_step * mapping.rate)  # of the rows

@@ -37,15 +37,11 @@ def least_motion(states: Sequence[Array], step: float) -> Array:
     of the range that holds 80 % of the rows.
 
     Args:
-        states: Of each run (K, n); rows with a NaN do not count for the spread.
+        states: Of each run (K, n); rows with a NaN do not count for the spread, and
+            some are without.
         step: Time step of the log [s].
-
-    Raises:
-        DataError: No row has a value of every state.
     """
     present = np.concatenate([rows[np.isfinite(rows).all(axis=1)] for rows in states])
-    if not len(present):
-        raise DataError("no row has a value of every state")
     low, high = np.quantile(present, [0.1, 0.9], axis=0)
     spread = (high - low) / 2
     of_runs = [_ranges_of_rest_time(rows, step) for rows in states]

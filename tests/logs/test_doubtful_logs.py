@@ -221,3 +221,47 @@ def test_row_vectors_are_columns(tmp_path):
     np.savez(tmp_path / "log.npz", **arrays)
     log = read_log(tmp_path / "log.npz", MAPPING)
     np.testing.assert_array_equal(log.runs[0].states[:, 0], table["x"])
+
+
+@pytest.mark.parametrize("is_stacked", [False, True])
+def test_rows_of_one_stamp_with_different_signals_are_one_row(tmp_path, is_stacked):
+    table = table_of()
+    rows = pandas.concat([table[["t", "x"]], table[["t", "u"]]])
+    if not is_stacked:
+        rows = rows.sort_values("t", kind="stable")
+    (run,) = read_log(written(tmp_path, table, "whole.csv"), MAPPING)
+    log = read_log(written(tmp_path, rows), MAPPING)
+    np.testing.assert_array_equal(log.runs[0].states, run.states)
+    np.testing.assert_array_equal(log.runs[0].inputs, run.inputs)
+    assert [finding.kind for finding in log.findings] == ["rows of one stamp"]
+    contradicting = pandas.concat([table, table[["t", "x"]] + [0.0, 0.1]])
+    path = written(tmp_path, contradicting.sort_values("t", kind="stable"))
+    log = read_log(path, MAPPING)
+    np.testing.assert_array_equal(log.runs[0].states, run.states)
+    assert [finding.kind for finding in log.findings] == ["repeated stamp"]
+
+
+def test_streams_with_rows_of_their_own_need_a_rate(tmp_path):
+    fast = table_of()[["t", "x"]]
+    slow = pandas.DataFrame({"t": 0.03 + 0.5 * np.arange(60)})
+    slow["p"] = np.sin(0.2 * slow["t"])
+    inputs = pandas.DataFrame({"t": 0.01 + 0.3 * np.arange(100), "u": np.arange(100)})
+    table = pandas.concat([fast, slow, inputs]).sort_values("t")
+    path = written(tmp_path, table)
+    mapping = {**MAPPING, "states": {"x": ["x"], "p": ["p"]}}
+    rule = "no row has a value of every signal: of 460 rows, x in 300, p in 60, u in"
+    with pytest.raises(DataError, match=f"{rule} 100; state a rate"):
+        read_log(path, mapping)
+    log = read_log(path, {**mapping, "rate": 10})
+    (run,) = log
+    assert len(run) >= 290
+    expected = np.interp(run.time, slow["t"], slow["p"])
+    np.testing.assert_allclose(run.states[:, 1], expected, atol=1e-9)
+    samples = np.searchsorted(inputs["t"], run.time + 1e-6, side="right") - 1
+    np.testing.assert_array_equal(run.inputs[:, 0], inputs["u"].to_numpy()[samples])
+    assert len(texts(log, "interpolated")) == 1
+    path = written(tmp_path, table.assign(u=np.nan))
+    with pytest.raises(DataError, match="u in 0; name columns that hold values"):
+        read_log(path, mapping)
+    with pytest.raises(DataError, match="u in 0; state a longer max_gap"):
+        read_log(path, {**mapping, "rate": 10})
