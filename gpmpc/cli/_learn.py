@@ -29,6 +29,7 @@ from gpmpc.logs._judging import (
     check_train,
     most_steps,
     most_told_steps,
+    short_pieces,
 )
 from gpmpc.logs._learning import fewest_rows
 from gpmpc.logs._log import LogRun
@@ -94,6 +95,8 @@ def learn(arguments: argparse.Namespace) -> Result:
         console.print(_not_told(judgement))
     for line in judgement.losses:
         console.print(f"loses: {line}")
+    for line in short_pieces(learned, judgement, held_out, train):
+        console.print(line)
     console.print(f"written to {folder}: {_MODEL}, report.html, report.md, card.md")
     for reason in reasons:
         print_error(f"do not use this model: {reason}")
@@ -349,7 +352,7 @@ def _make_report(
         notes.append(_not_told(judgement))
     if learned.control is not None:
         lists["For control"] = [*learned.control.warnings, *learned.control.advice]
-    runs = ", ".join(run.name for run in held_out)
+    notes += [f"{one}." for one in short_pieces(learned, judgement, held_out, train)]
     return Document(
         title=title,
         tables=[
@@ -361,13 +364,22 @@ def _make_report(
         ],
         data=judgement.to_pandas(),
         lead=(
-            f"{judgement.windows} predictions on {runs}; "
+            f"{_predictions(judgement)} on {', '.join(judgement.runs)}; "
             f"learned from {len(train)} rows of {len(train.runs)} runs."
         ),
         notes=notes,
         lists=lists,
         images={"report.png": png(judgement_figure(judgement))},
     )
+
+
+def _predictions(judgement: Judgement) -> str:
+    """Says how many predictions were judged, by the steps ahead where they differ."""
+    if len(set(judgement.windows)) == 1:
+        return f"{judgement.windows[0]} predictions"
+    numbers = " / ".join(map(str, judgement.windows))
+    steps = " / ".join(map(str, judgement.steps))
+    return f"{numbers} predictions {steps} steps ahead"
 
 
 def _not_told(judgement: Judgement) -> str:
@@ -476,7 +488,7 @@ def _make_card(
     return Document(
         title=title,
         tables=[
-            Table(["", ""], _facts(learned, train, held_out), "What it is"),
+            Table(["", ""], _facts(learned, judgement, train), "What it is"),
             _table_of_comparisons(learned, judgement),
             Table(
                 ["parameter", "value", "standard error"],
@@ -492,14 +504,14 @@ def _make_card(
         data=pd.DataFrame(),
         lists={
             "Outputs": _outputs(learned),
-            "What must not be trusted": _doubts(learned, judgement),
+            "What must not be trusted": _doubts(learned, judgement, held_out, train),
             "Left out of the data": left_out or ["nothing"],
         },
     )
 
 
 def _facts(
-    learned: IdentifiedModel, train: Log, held_out: Log
+    learned: IdentifiedModel, judgement: Judgement, train: Log
 ) -> list[tuple[str, Any]]:
     """Returns what a model is, and what made it."""
     origin = provenance()
@@ -510,7 +522,7 @@ def _facts(
         ("runs", ", ".join(learned.runs)),
         ("rate", f"{1 / train.time_step:g} Hz"),
         ("candidates compared on", learned.folds),
-        ("judged on", ", ".join(run.name for run in held_out)),
+        ("judged on", ", ".join(judgement.runs)),
         ("intervals hold", _NOISE_IN_WORDS),
         ("made", origin["created"]),
         ("made by", describe_code(origin)),
@@ -533,7 +545,9 @@ def _outputs(learned: IdentifiedModel) -> list[str]:
     return lines
 
 
-def _doubts(learned: IdentifiedModel, judgement: Judgement) -> list[str]:
+def _doubts(
+    learned: IdentifiedModel, judgement: Judgement, held_out: Log, train: Log
+) -> list[str]:
     """Returns what must not be trusted."""
     nominal = learned.model.nominal
     doubts = [*_reasons_against(learned, judgement)]
@@ -544,6 +558,7 @@ def _doubts(learned: IdentifiedModel, judgement: Judgement) -> list[str]:
         for loss in judgement.losses
         if loss not in doubts
     ]
+    doubts += [f"{one}." for one in short_pieces(learned, judgement, held_out, train)]
     if learned.control is not None:
         doubts += learned.control.warnings
     if learned.model.correction is not None or learned.model.start_filter is not None:

@@ -9,7 +9,7 @@ a width of one is honest.
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,7 @@ MODEL = "model"  # name of the judged model among the predictors
 _WINDOWS = 1000
 _ROUNDING_SHARE = 1e-9  # of a constant state's error: an error by rounding
 _LINEARIZED = 100  # windows linearised at once
+_LEAST_SHORT_SHARE = 0.02  # of the rows in short pieces, that is told
 
 
 @dataclass(frozen=True)
@@ -64,10 +65,11 @@ class Judgement:
     #: exact interval of that frequency, from independent windows only (k, groups, 2)
     coverage_interval: Array
     width: Array  #: claimed over actual root mean square (k, groups)
-    windows: int  #: number of predictions
+    windows: tuple[int, ...]  #: number of predictions by k
     level: float = LEVEL  #: of the intervals
     #: errors of the model over those of each baseline, with intervals
     comparisons: tuple[Comparison, ...] = ()
+    runs: tuple[str, ...] = ()  #: names of the runs that were predicted
 
     @property
     def losses(self) -> tuple[str, ...]:
@@ -160,15 +162,42 @@ def judge(
     for name, log in (("held_out", held_out), ("train", train)):
         _check_time_step(name, log, learned)
         _check_signals(name, log, learned)
+    names = [run.name for run in held_out]
+    parts = [
+        _judge_windows(learned, train, windows, own_steps, names, longest=max(steps))
+        for windows, own_steps in held_out.windows_by_step(
+            steps, _past_rows(learned), most=_WINDOWS
+        )
+    ]
+    return _joined(parts)
+
+
+def _judge_windows(
+    learned: IdentifiedModel,
+    train: Log,
+    windows: Windows,
+    steps: Sequence[int],
+    names: Sequence[str],
+    longest: int,
+) -> Judgement:
+    """Judges a learned model on windows.
+
+    Args:
+        learned: From ``learn``.
+        train: To which the baselines are fitted.
+        windows: Of held-out runs.
+        steps: After the starts.
+        names: Of the held-out runs.
+        longest: Steps of the longest prediction, also of other windows.
+    """
     model = learned.model
-    space = held_out.space
-    windows = held_out.windows(max(steps), _past_rows(learned), most=_WINDOWS)
+    space = windows.space
     model_errors = model.rollout_errors(windows, steps)
     errors = {MODEL: model_errors}
     errors |= baseline_errors(model.kinematics, train, windows, steps)
     distances = {name: space.distances(e) for name, e in errors.items()}
     variances = _claimed_variances(learned, windows, steps)
-    variances = follow_errors(windows, model_errors, variances, steps)
+    variances = follow_errors(windows, model_errors, variances, steps, longest)
     half_width = ndtri((1 + LEVEL) / 2) * np.sqrt(variances)
     coverage = _group_means(space, np.abs(model_errors) <= half_width)
     claimed = _group_means(space, variances)
@@ -182,9 +211,40 @@ def judge(
         coverage=coverage,
         coverage_interval=_coverage_intervals(coverage, windows, steps),
         width=np.sqrt(claimed / np.maximum(actual, 1e-300)),
-        windows=len(windows),
-        comparisons=_comparisons(distances, windows, steps),
+        windows=(len(windows),) * len(steps),
+        comparisons=_comparisons(distances, windows, steps, longest),
+        runs=tuple(names[number] for number in np.unique(windows.runs)),
     )
+
+
+def _joined(parts: Sequence[Judgement]) -> Judgement:
+    """Joins judgements of some steps each."""
+    first = parts[0]
+    return replace(
+        first,
+        steps=tuple(step for part in parts for step in part.steps),
+        mean=_by_name([part.mean for part in parts]),
+        rmse=_by_name([part.rmse for part in parts]),
+        coverage=np.concatenate([part.coverage for part in parts]),
+        coverage_interval=np.concatenate([part.coverage_interval for part in parts]),
+        width=np.concatenate([part.width for part in parts]),
+        windows=tuple(number for part in parts for number in part.windows),
+        comparisons=tuple(
+            Comparison(
+                name=own[0].name,
+                ratio=np.concatenate([one.ratio for one in own]),
+                low=np.concatenate([one.low for one in own]),
+                high=np.concatenate([one.high for one in own]),
+            )
+            for own in zip(*(part.comparisons for part in parts), strict=True)
+        ),
+        runs=tuple(dict.fromkeys(name for part in parts for name in part.runs)),
+    )
+
+
+def _by_name(parts: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+    """Joins arrays (k, groups) of some steps each, by their names."""
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def check_held_out(held_out: Log) -> None:
@@ -245,6 +305,29 @@ def most_told_steps(learned: IdentifiedModel, held_out: Log) -> int:
     while _starts(rows, steps + 1) >= FEWEST_PREDICTIONS * (steps + 1):
         steps += 1
     return steps
+
+
+def short_pieces(
+    learned: IdentifiedModel, judgement: Judgement, held_out: Log, train: Log
+) -> tuple[str, ...]:
+    """Returns sentences on the rows in pieces too short for the longest rollouts."""
+    past = _past_rows(learned)
+    sentences = []
+    steps = judgement.steps[-1]
+    share = 1 - held_out.share_in_pieces(past + steps + 1)
+    if share >= _LEAST_SHORT_SHARE:
+        sentences.append(
+            f"{share:.0%} of the held-out rows lie in pieces too short for predictions "
+            f"{steps} steps ahead: they count at fewer steps, if at all"
+        )
+    steps = learned.judged_steps[-1]
+    share = 1 - train.share_in_pieces(past + steps + 1)
+    if share >= _LEAST_SHORT_SHARE:
+        sentences.append(
+            f"{share:.0%} of the rows to learn from lie in pieces too short for "
+            f"rollouts of {steps} steps: on these, structures were not compared"
+        )
+    return tuple(sentences)
 
 
 def _past_rows(learned: IdentifiedModel) -> int:
@@ -327,14 +410,17 @@ def _check_steps(steps: Sequence[int]) -> None:
 
 
 def _comparisons(
-    distances: Mapping[str, Array], windows: Windows, steps: Sequence[int]
+    distances: Mapping[str, Array],
+    windows: Windows,
+    steps: Sequence[int],
+    longest: int,
 ) -> tuple[Comparison, ...]:
     """Compares the errors of the model with those of each baseline.
 
     What is exact but for rounding is as good as anything that is.
     """
     rounding = _ROUNDING_SHARE * distances[CONSTANT_STATE].mean(axis=0)
-    block = 2 * -(-windows.ahead // windows.stride)
+    block = 2 * -(-longest // windows.stride)
     return tuple(
         compare(
             name=name,

@@ -52,15 +52,25 @@ class LogRun:
         """The first row, and the row after the last, of each piece."""
         return list(zip(self.begins, (*self.begins[1:], len(self)), strict=True))
 
-    def starts(self, past: int, ahead: int, stride: int = 1) -> np.ndarray:
-        """Lists rows with ``past`` rows before and ``ahead`` after in their piece."""
-        return np.concatenate(
-            [np.arange(begin + past, end - ahead, stride) for begin, end in self.pieces]
-        ).astype(int)
+    def starts(
+        self, past: int, ahead: int, stride: int = 1, longest: int = 0
+    ) -> np.ndarray:
+        """Lists rows with ``past`` rows before and ``ahead`` after in their piece.
 
-    def windows(self, past: int, ahead: int, stride: int) -> RunWindows:
+        Those of pieces that have room for ``longest`` rows after have as many.
+        """
+        starts = []
+        for begin, end in self.pieces:
+            has_room = end - begin > past + longest
+            last = end - max(ahead, longest) if has_room else end - ahead
+            starts.append(np.arange(begin + past, last, stride))
+        return np.concatenate(starts).astype(int)
+
+    def windows(
+        self, past: int, ahead: int, stride: int, longest: int = 0
+    ) -> RunWindows:
         """Cuts windows around every ``stride``-th start; see ``Log.windows``."""
-        starts = self.starts(past, ahead, stride)
+        starts = self.starts(past, ahead, stride, longest)
         rows = starts[:, None] + np.arange(-past, ahead + 1)
         return RunWindows(
             states=self.states[rows],
@@ -242,7 +252,52 @@ class Log:
         if most is not None:
             check_number("most", most, least=1, whole=True)
             stride = self._stride_for(most, rows=past + ahead)
-        windows = [run.windows(past, ahead, stride) for run in self.runs]
+        return self._windows(past, ahead, stride)
+
+    def windows_by_step(
+        self, steps: Sequence[int], past: int, most: int
+    ) -> list[tuple[Windows, tuple[int, ...]]]:
+        """Cuts windows for some numbers of steps ahead, also of short pieces.
+
+        In a piece that has room for the most steps, windows of fewer start at the same
+        rows. A piece that has not counts at those that it has room for.
+
+        Args:
+            steps: Increasing numbers of rows after the starts.
+            past: Rows before them.
+            most: Number of windows, about.
+
+        Returns:
+            Windows, each with the steps that they are for.
+
+        Raises:
+            DataError: No piece has room for the most steps.
+        """
+        longest = steps[-1]
+        windows = self.windows(longest, past, most=most)
+        lengths = np.array(self._lengths_of_pieces())
+        is_short = (past + steps[0] < lengths) & (lengths <= past + longest)
+        if not is_short.any():
+            return [(windows, tuple(steps))]
+        by_step = []
+        for step in steps:
+            rows = past + np.where(lengths > past + longest, longest, step)
+            starts = np.maximum(lengths - rows, 0).sum()
+            stride = max(-(-int(starts) // most), windows.stride)
+            own = self._windows(past, step, stride, longest)
+            every = max(len(own) // most, 1)  # many pieces have a window each
+            own = replace(own[::every], stride=every * stride)
+            by_step.append((own, (step,)))
+        return by_step
+
+    def share_in_pieces(self, rows: int) -> float:
+        """Returns the share of rows in pieces of so many rows at least."""
+        lengths = self._lengths_of_pieces()
+        return sum(length for length in lengths if length >= rows) / len(self)
+
+    def _windows(self, past: int, ahead: int, stride: int, longest: int = 0) -> Windows:
+        """Cuts windows around every ``stride``-th start of each run."""
+        windows = [run.windows(past, ahead, stride, longest) for run in self.runs]
         if not sum(len(own.times) for own in windows):
             raise DataError(
                 f"windows of {past + ahead + 1} rows need a piece as long; the longest "

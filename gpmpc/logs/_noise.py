@@ -66,7 +66,11 @@ def error_variances(
 
 
 def follow_errors(
-    windows: Windows, errors: Array, variances: Array, steps: Sequence[int]
+    windows: Windows,
+    errors: Array,
+    variances: Array,
+    steps: Sequence[int],
+    longest: int = 0,
 ) -> Array:
     """Scales claimed variances by the errors of earlier predictions of the same run.
 
@@ -85,11 +89,12 @@ def follow_errors(
         errors: Of predictions (W, steps, e).
         variances: Claimed (W, steps, e).
         steps: After the starts of the windows.
+        longest: Steps of the longest prediction, where that is none of these.
 
     Returns:
         The scaled variances (W, steps, e).
     """
-    longest = max(steps) * windows.time_step
+    longest_time = max(*steps, longest) * windows.time_step  # [s]
     # From one prediction to the next; pauses between pieces are no part of it.
     spacing = windows.stride * windows.time_step  # [s]
     scaled = variances.copy()
@@ -100,7 +105,7 @@ def follow_errors(
             prior_time = max(_PRIOR * step, _LEAST_PRIOR) * windows.time_step  # [s]
             # A prediction that is just over has the age of half a step.
             age = times[:, None] - times - (step - 0.5) * windows.time_step
-            decay = np.exp(-np.maximum(age, 0) / (_FORGETTING * longest))
+            decay = np.exp(-np.maximum(age, 0) / (_FORGETTING * longest_time))
             weights = np.where(age > 0, spacing * decay, 0.0)  # [s]
             deviations = np.sqrt(np.maximum(variances[rows, k], _SMALLEST_VARIANCE))
             prior = prior_time * deviations

@@ -24,7 +24,7 @@ from gpmpc.logs import (
     read_log,
     save_learned,
 )
-from gpmpc.logs._judging import check_learned, most_steps
+from gpmpc.logs._judging import check_learned, most_steps, short_pieces
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._noise import _scales, error_variances, follow_errors
 from gpmpc.logs._output_gps import choose_rows, train_output_gp
@@ -265,11 +265,26 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
     assert not untold.losses
     (reason,) = _reasons_against(learned, untold)
     assert "10 steps ahead: too few held-out rows to tell" in reason
+    # Pieces too short for the longest predictions count at shorter ones.
+    (run,) = held_out.runs
+    begins = (0, 300, 350, 400, 450)
+    runs = (replace(run, begins=begins), run.part(0, 20, "stub"))
+    pieces = replace(held_out, runs=runs)
+    judgement = judge(learned, pieces, train, steps=(1, 50))
+    parts = [run.part(begin, begin + 50, "short") for begin in begins[1:]]
+    alone = replace(held_out, runs=(run.part(0, 251, "long"), *parts))
+    expected = judge(learned, alone, train, steps=(1,))
+    assert judgement.windows[:1] == expected.windows
+    for name, mean in expected.mean.items():
+        np.testing.assert_allclose(judgement.mean[name][:1], mean, rtol=1e-9)
+    assert judgement.runs == (run.name,)
+    (sentence,) = short_pieces(learned, judgement, pieces, train)
+    assert "42% of the held-out rows" in sentence
     # Of short pieces the baselines are fitted to fewer steps.
     short = [replace(run, begins=tuple(range(0, 500, 70))) for run in train]
     train = replace(train, runs=tuple(short))
     assert most_steps(learned, held_out, train) == 49
-    assert judge(learned, held_out, train, steps=(1, 49)).windows
+    assert min(judge(learned, held_out, train, steps=(1, 49)).windows)
     losses = judge(wrong, held_out, train, steps=(1, 10)).losses
     assert any(
         "rate 10 steps ahead" in loss and "constant state" in loss for loss in losses
