@@ -81,7 +81,8 @@ class SolverFailure(GpmpcError, RuntimeError):
 class Diverged(GpmpcError, ArithmeticError):
     """A simulated system left the finite numbers, or its episode ended."""
 
-    #: the ``Rollout`` of a closed loop up to there; None where that was its first step
+    #: the ``Rollout`` of a closed loop up to there (``CascadeRollout`` of a cascade),
+    #: without the step that it failed in: None where that was the first
     rollout: Any = None
 
     def __init__(self, step: int, message: str):

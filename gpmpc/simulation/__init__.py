@@ -1,6 +1,8 @@
 """Closed loops of a controller and a plant or a model.
 
-With noise, disturbances and many seeds.
+With noise, disturbances and many seeds. None of them filters: a filter is a
+``Controller`` of one's own around a ``GPMPC``, as ``FilteredControl`` of
+``benchmarks/disturbance_states.py`` is.
 """
 
 from gpmpc.simulation._cascade_loop import Cascade, cascade_loop

@@ -142,7 +142,8 @@ def cascade_loop(
             controller without ``control``, of other names, or of another time step,
             than its loop.
         SolverFailure: Its step is that of the controller that failed.
-        Diverged: Its step is an inner one.
+        Diverged: Its step is an inner one; ``rollout`` holds the steps before, and its
+            last outer step may have fewer inner ones.
 
     See Also:
         ``Cascade``; ``closed_loop`` for one controller.
@@ -225,15 +226,18 @@ class _CascadeFlight:
         belief = self._simulator.measure(time)
         measured = np.array(to_array(belief.mean))
         outer_reference = self._scenario.reference_from(outer_step)
-        if self._thrust is None or phase == 0:
+        if phase == 0:
             self._thrust = self._decide_thrust(belief, outer_reference, outer_step)
         thrust = self._thrust
+        assert thrust is not None  # the first inner step is the first of an outer one
         attitude = self._attitude_reference(thrust, measured, phase)
         attitude_states = np.array(attitude.states)  # recorded
         moments = self._decide_moments(belief, attitude, inner_step)
         decided_input = np.append(thrust.input[:1], moments.input)
         (result,) = step_together([self._simulator], time, [decided_input])
         if isinstance(result, Diverged):
+            if self._inputs:
+                result.rollout = self.rollout()
             raise result
         if phase == 0:
             self._outer.add(
@@ -287,6 +291,7 @@ class _CascadeFlight:
         angles = measured[6::2]
         if np.isfinite(angles).all():
             self._angles = angles
+        # Its first input belongs to the outer step under way, after a failure as well.
         planned = thrust.input[None]
         if thrust.plan is not None:
             planned = thrust.plan.inputs

@@ -66,8 +66,8 @@ class _Window(Disturbance):
 class Gust(_Window):
     """A constant push on single states over a time window.
 
-    The plant integrates it like any other force. (Where the dynamics give the next
-    state, it is added to that.)
+    The plant integrates it like any other force. Where the dynamics give the next
+    state, rate times time step is added to that.
 
     >>> Gust({"vx": 0.5}, start=20.0, stop=40.0).rates
     {'vx': 0.5}
@@ -100,6 +100,11 @@ class Gust(_Window):
                 raise SettingError(
                     "rates", f"must name states of the plant, {names}; got {name!r}"
                 )
+        if plant.stateful:
+            raise UnsupportedModel(
+                "a gust needs equations, which a simulator has not. "
+                "Possible with any plant: Replaced"
+            )
         if not self.acts(time):
             return plant
         rates = [float(self.rates.get(name, 0.0)) for name in plant.state_names]
@@ -145,6 +150,9 @@ class Replaced(_Window):
 class Dropout(_Window):
     """Nothing is measured over a time window: entries of the state are NaN.
 
+    A controller is called with whole measurements alone: where any entry is missing the
+    policy for failures decides, so a filter within a controller sees none of the step.
+
     >>> Dropout(start=1.0, stop=1.5, entries=[0]).entries
     (0,)
 
@@ -161,11 +169,15 @@ class Dropout(_Window):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.entries is not None:
-            entries = tuple(np.asarray(self.entries).tolist())
-            object.__setattr__(self, "entries", entries)
-        for entry in self.entries or ():
+        if self.entries is None:
+            return
+        entries = np.asarray(self.entries).tolist()
+        if not isinstance(entries, list) or not entries:
+            rule = "must be a list of indices of states, or None for all of them"
+            raise SettingError("entries", f"{rule}; got {self.entries!r}")
+        for entry in entries:
             check_number("entries", entry, least=0, whole=True)
+        object.__setattr__(self, "entries", tuple(entries))
 
     def disturb_plant(self, plant: System, time: float) -> System:
         """Returns the plant.
@@ -195,22 +207,19 @@ class Dropout(_Window):
 
 @lru_cache(maxsize=8)
 def _pushed(plant: System, rates: tuple[float, ...]) -> System:
-    """Returns a plant with constants (n,) added to its equations.
+    """Returns a plant with constant rates (n,) added to its equations.
 
-    They are added to its right-hand side, or to its next state.
+    They are added to its right-hand side; over a time step to its next state.
     """
-    if plant.stateful:
-        raise UnsupportedModel(
-            "a gust needs equations, which a simulator has not. "
-            "Possible with any plant: Replaced"
-        )
     dynamics = plant.dynamics
     method = "successor" if hasattr(dynamics, "successor") else "derivative"
     function = getattr(dynamics, method)
+    duration = plant.time_step if method == "successor" else 1.0
+    changes = [rate * duration for rate in rates]
 
     def pushed(x: Any, u: Any) -> list[Any]:
-        entries = zip(function(x, u), rates, strict=True)
-        return [entry + rate for entry, rate in entries]
+        entries = zip(function(x, u), changes, strict=True)
+        return [entry + change for entry, change in entries]
 
     pushed_dynamics = SimpleNamespace(
         state_names=plant.state_names, input_names=plant.input_names

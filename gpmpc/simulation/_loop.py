@@ -28,7 +28,7 @@ from gpmpc.mpc import Controller, Reference
 from gpmpc.mpc._controller import read_reference
 from gpmpc.mpc._policy import Command, OnFailure, decide_many
 from gpmpc.signals import Signals, signals_of
-from gpmpc.simulation._disturbances import Disturbance
+from gpmpc.simulation._disturbances import Disturbance, Replaced
 from gpmpc.simulation._flight import Flight
 from gpmpc.simulation._rollout import Rollout
 from gpmpc.simulation._scenario import Scenario
@@ -69,7 +69,7 @@ def closed_loop(
         steps: K.
         noise: On a plant's states, measurements and inputs.
         disturbances: Gusts, other plants, dropouts: what the controller does not know
-            of.
+            of. Each changes what those before it in the list left.
         on_failure: What is applied where a solve fails: ``"previous_plan"``, ``"hold"``
             or ``"raise"``; see ``ControlLoop``.
         seed: Of all random numbers; equal seeds give equal numbers.
@@ -83,10 +83,11 @@ def closed_loop(
         SettingError: An unknown policy, negative noise, noise in a model loop, kappas
             that the controller cannot use, or a controller of other names of states and
             inputs, or another time step, than the plant has.
+        UnsupportedModel: A gust on a simulator.
         SolverFailure: A solve failed, and the policy is ``"raise"`` or there was
             nothing to fall back on.
         Diverged: The system left the finite numbers; ``rollout`` holds the steps
-            before.
+            before, as does what ``on_step`` records: not the one that it failed in.
 
     See Also:
         ``closed_loops`` for many seeds; ``gpmpc.plotting.flight_figure``, which draws
@@ -184,6 +185,10 @@ def closed_loops(
         ``closed_loop``, whose numbers a trial has.
     """
     _check_plant_of_trials(plant)
+    if isinstance(disturbances, Sequence):
+        for disturbance in disturbances:
+            if isinstance(disturbance, Replaced):
+                _check_plant_of_trials(disturbance.plant)
     scenario = Scenario(
         system=plant,
         controller=controller,
@@ -219,7 +224,8 @@ def rehearse(
 
     A flight's times then hold no compiling and loading. There are two, since the second
     one starts from a plan, or one where the references are of no more. What fails here
-    is left to the flight to raise.
+    is left to the flight to raise. What a controller of one's own remembers of them,
+    such as a filter's belief, it has to forget by itself.
 
     See Also:
         ``closed_loop``; ``gpmpc.mpc.ControlLoop.warm_up``, without a plant.

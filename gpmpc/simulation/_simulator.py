@@ -18,6 +18,7 @@ from gpmpc._arrays import UNMEASURED, is_measured, read_array
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import DynamicsModel, to_array
 from gpmpc.exceptions import (
+    DataError,
     Diverged,
     SettingError,
     ShapeError,
@@ -25,7 +26,7 @@ from gpmpc.exceptions import (
     check_number,
     check_numbers,
 )
-from gpmpc.gaussian import Gaussian
+from gpmpc.gaussian import Gaussian, check_covariance
 from gpmpc.models._past import belief_of_all, first_signals, has_past, measured_dim
 from gpmpc.propagation import Propagator
 from gpmpc.signals import Signals, signals_of
@@ -165,7 +166,8 @@ class PlantSimulator:
         }
         self.mean = self._initial_state(initial, seed)
         self.covariance = np.zeros((len(self.mean), len(self.mean)))
-        # A disturbance that does not fit is found before the first step.
+        # A disturbance that does not fit says so before the first step, in its window
+        # or not.
         self._disturbed_plant(0.0)
 
     def _initial_state(self, initial: Any, seed: int) -> Array:
@@ -182,6 +184,7 @@ class PlantSimulator:
             return _check_state(initial, n, plant.state_names)
         belief = initial.in_order(plant.state_names)
         mean = _check_state(belief.mean, n, plant.state_names)
+        check_covariance("initial.covariance", belief.covariance)
         covariance = to_array(belief.covariance)
         return self._streams["initial"].multivariate_normal(mean, covariance)
 
@@ -198,8 +201,9 @@ class PlantSimulator:
     def measure(self, time: float) -> Gaussian:
         """Returns a measurement of the state at a time [s].
 
-        It is taken for certain: controllers of this package filter nothing. What
-        disturbances and controllers do to its array does nothing to the state.
+        It is taken for certain: controllers of this package filter nothing (a filter is
+        a ``Controller`` of one's own around one of them). What disturbances and
+        controllers do to its array does nothing to the state.
         """
         measured = self._add_noise("measurement", self.mean.copy())
         for disturbance in self.disturbances:
@@ -224,9 +228,7 @@ class PlantSimulator:
 
     def _clipped(self, input: Array) -> Array:
         """Returns an input (m,) as a foreign simulator takes it."""
-        if not self.plant.stateful:
-            return input
-        limits = getattr(self.plant.dynamics, "limits", None)
+        limits = getattr(self.plant.dynamics, "input_limits", None)
         return input if limits is None else np.clip(input, *limits)
 
     def _move_to(self, state: Array, input: Array) -> Diverged | None:
@@ -319,6 +321,7 @@ class ModelSimulator:
             belief = initial.in_order(names)
             mean = belief.mean
             covariance = belief.covariance
+            check_covariance("initial.covariance", covariance)
         if covariance is None:
             covariance = _INITIAL_DEVIATION**2 * torch.eye(n, **options)
         mean = torch.as_tensor(_check_state(mean, n, names), **options)
@@ -361,9 +364,14 @@ class ModelSimulator:
     def step(self, input: Array) -> Diverged | None:
         """Carries the belief one step on; returns why it cannot go on, if so."""
         control = torch.as_tensor(np.asarray(input, dtype=float)).to(self._belief.mean)
-        propagated = self.loop.propagator.propagate(
-            self.loop.model, self._belief, control
-        )
+        try:
+            propagated = self.loop.propagator.propagate(
+                self.loop.model, self._belief, control
+            )
+        except DataError as error:  # its start was checked: it has overflowed since
+            return Diverged(
+                self._steps, f"the model's belief cannot be carried on: {error}"
+            )
         belief = propagated.belief
         mean_is_finite = is_measured(to_array(belief.mean)).all()
         covariance_is_finite = torch.isfinite(belief.covariance).all()
@@ -410,7 +418,7 @@ def step_together(
         simulator._noisy_input(input)
         for simulator, input in zip(simulators, inputs, strict=True)
     ]
-    # Disturbances look at the time, not at a trial.
+    # All trials of a scenario share their disturbances, which look at the time alone.
     plant = simulators[0]._disturbed_plant(time)
     with np.errstate(over="ignore", invalid="ignore"):
         if len(simulators) == 1:

@@ -1,8 +1,8 @@
 """Systems of textbooks, from the double integrator to a stirred-tank reactor.
 
-Angles are zero where a pole or a link stands upright, positive anticlockwise. Each
-function makes a system with a time step [s]; its other arguments are the attributes of
-the right-hand side.
+Angles are zero where a pole or a link stands upright, positive anticlockwise; but that
+of ``cart_pole`` is positive towards growing positions. Each function makes a system
+with a time step [s]; its other arguments are the attributes of the right-hand side.
 """
 
 from collections.abc import Sequence

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from gpmpc._calls import explains_arguments
+from gpmpc.exceptions import check_number
 from gpmpc.systems._elementary import cos, sin, sqrt, tan
 from gpmpc.systems._system import System
 
-_SLOWEST = 0.5  # [m/s] below which the slip of a tyre is that of this speed
+_SLOWEST = 0.5  # [m/s] that a slip counts besides the speed: no car divides by zero
 
 
 @explains_arguments
@@ -27,7 +28,8 @@ class KinematicBicycle:
         ``kinematic_bicycle``, which makes a system of it.
     """
 
-    curvature: float = 1.0  #: of the path, per tangent of the steering: 1 / wheelbase
+    #: of the path, per unit of steering while that is small: steering_scale / wheelbase
+    curvature: float = 1.0
     rear_length: float = 0.0  #: from the rear axle to where the position is taken [m]
     steering_offset: float = 0.0  #: added to the steering, in its unit
     steering_scale: float = 1.0  #: angle of a unit of steering [rad]
@@ -37,6 +39,9 @@ class KinematicBicycle:
 
     state_names = ("x", "y", "heading", "speed")
     input_names = ("steering", "drive")
+
+    def __post_init__(self) -> None:
+        check_number("steering_scale", self.steering_scale, above=0, unit="[rad]")
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (x, y, heading, speed) [m/s, m/s, rad/s, m/s^2]."""
@@ -62,7 +67,9 @@ class DynamicBicycle:
     """A car whose tyres slip, with forces that saturate.
 
     Source: Rajamani (2012), Vehicle Dynamics and Control, chapter 2, with a tyre force
-    F = C a / sqrt(1 + (C a / grip)^2) at a slip a, all divided by the mass.
+    F = C a / sqrt(1 + (C a / grip)^2) at a slip a, all divided by the mass. A slip is a
+    tyre's speed sideways over its speed v forwards, here over sqrt(v^2 + (0.5 m/s)^2):
+    a car at rest is not turned by its steering, and it may drive backwards.
 
     See Also:
         ``dynamic_bicycle``, which makes a system of it.
@@ -93,8 +100,10 @@ class DynamicBicycle:
         rate = x[5]
         rolling = sqrt(forward * forward + _SLOWEST * _SLOWEST)
         steering = self.steering_gain * (u[0] + self.steering_offset)
-        front_slip = steering - (lateral + self.front_length * rate) / rolling
-        rear_slip = -(lateral - self.rear_length * rate) / rolling
+        front_lateral_speed = lateral + self.front_length * rate
+        rear_lateral_speed = lateral - self.rear_length * rate
+        front_slip = (steering * forward - front_lateral_speed) / rolling
+        rear_slip = -rear_lateral_speed / rolling
         front = _tyre_force(front_slip, self.front_stiffness, self.front_grip)
         rear = _tyre_force(rear_slip, self.rear_stiffness, self.rear_grip)
         drive = self.drive_gain * u[1] + self.drive_offset - self.drag * forward
@@ -273,7 +282,7 @@ def differential_drive(time_step: float = 0.1, **parameters: float) -> System:
 
 
 def _tangent(car: KinematicBicycle, steering: Any) -> Any:
-    """Returns the tangent of the steering's angle, per unit of steering's scale."""
+    """Returns the tangent of the steering's angle, over the angle of a unit."""
     angle = car.steering_scale * (steering + car.steering_offset)
     return tan(angle) / car.steering_scale
 

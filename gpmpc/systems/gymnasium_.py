@@ -62,7 +62,7 @@ class _Environment(Simulator):
             )
         lowest = action_space.low.astype(float)
         highest = action_space.high.astype(float)
-        self.limits = (lowest, highest)
+        self.input_limits = (lowest, highest)
         n = len(self.reset(0))
         m = len(lowest)
         self.state_names = tuple(state_names or [f"x{i + 1}" for i in range(n)])
@@ -77,7 +77,7 @@ class _Environment(Simulator):
         return self._state(self.environment.reset(seed=seed)[0])
 
     def _step(self, input: Array) -> tuple[Array, bool]:
-        action = np.clip(input, *self.limits).astype(
+        action = np.clip(input, *self.input_limits).astype(
             self.environment.action_space.dtype
         )
         observation, _, terminated, truncated, _ = self.environment.step(action)
@@ -162,7 +162,7 @@ def gymnasium_system(
         time_step = getattr(dynamics.environment.unwrapped, "dt", None)
     if time_step is None:
         raise SettingError("time_step", "is not known of this environment; say it [s]")
-    lower, upper = dynamics.limits
+    lower, upper = dynamics.input_limits
     defaults = {
         "name": str(environment),
         "input_lower": lower,
@@ -177,9 +177,18 @@ def make_environment(system: System | str, **settings: Any) -> Any:
     The system may be one of this package's, by name and settings. The observation is
     the state. The reward is minus the squared distance of the tracked states from the
     goal, summed over their units; an episode ends where those of one unit are farther
-    from it than at the start, and than ``System.lost``.
+    from it than at the start, and than ``System.lost``. A simulator starts where it
+    starts by itself.
+
+    Raises:
+        SettingError: There are settings beside a system that was made.
     """
     gymnasium = library("gymnasium")
+    if settings and not isinstance(system, str):
+        named = ", ".join(settings)
+        raise SettingError(
+            "system", f"must be a name where settings are given; got {named} beside one"
+        )
     flown: System = (
         getattr(systems, system)(**settings) if isinstance(system, str) else system
     )
@@ -205,7 +214,10 @@ def make_environment(system: System | str, **settings: Any) -> Any:
             """Starts where the system starts, or from its region."""
             super().reset(seed=seed)
             self.state = np.array(flown.start or flown.goal, dtype=float)
-            if flown.start is None and flown.region is not None:
+            if flown.stateful:
+                drawn_seed = int(self.np_random.integers(2**31))
+                self.state = flown.dynamics.reset(drawn_seed)
+            elif flown.start is None and flown.region is not None:
                 lower, upper = flown.region
                 self.state = self.np_random.uniform(lower, upper)
             self._limits = {

@@ -36,7 +36,7 @@ class _Model:
         low, high = self.model.actuator_ctrlrange[self.controls].T
         lowest = np.where(limited, low, -np.inf)
         highest = np.where(limited, high, np.inf)
-        self.limits = (lowest, highest)
+        self.input_limits = (lowest, highest)
 
     def indices(self, kind: str, names: Sequence[str]) -> list[int]:
         """Returns the indices of named parts of the model of a kind.
@@ -172,7 +172,7 @@ class _Sensors(_Model, Simulator):
         return self._measure()
 
     def _step(self, input: Array) -> tuple[Array, bool]:
-        self._waiting = [*self._waiting, np.clip(input, *self.limits)]
+        self._waiting = [*self._waiting, np.clip(input, *self.input_limits)]
         self.data.ctrl[self.controls] = self._waiting.pop(0)
         self.mujoco.mj_step(self.model, self.data, self.substeps)
         self.mujoco.mj_forward(self.model, self.data)
@@ -236,7 +236,7 @@ def mujoco_system(
         dynamics = _Sensors(
             path, sensors, actuators, substeps=substeps, **(observation or {})
         )
-    lower, upper = dynamics.limits
+    lower, upper = dynamics.input_limits
     defaults = {
         "name": Path(path).stem,
         "input_lower": lower,

@@ -19,9 +19,7 @@ from gpmpc.systems.mujoco_ import mujoco_system
 
 _MODEL = Path(__file__).with_name("quadrotor.xml")
 ROTORS = ("u1", "u2", "u3", "u4")
-# of the model [N s/m], [kg]
-_DRAG = 0.25
-_MASS = 0.5
+_MASS = 0.5  # of the model [kg]
 
 
 @dataclass(frozen=True)
@@ -153,7 +151,8 @@ def mujoco_quadrotor(
     flown.dynamics.mujoco.mj_setConst(model, flown.dynamics.data)
     # Linear drag in a wind is drag in still air and a constant force, which gravity on
     # the one body can bring.
-    model.opt.gravity += _DRAG * np.array(wind) / mass
+    drag = model.dof_damping[[model.joint(axis).dofadr[0] for axis in "xyz"]]  # [N s/m]
+    model.opt.gravity += drag * np.array(wind) / mass
     return flown
 
 

@@ -3,7 +3,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gpmpc.exceptions import SettingError, ShapeError, SolverFailure
+from gpmpc.exceptions import Diverged, SettingError, ShapeError, SolverFailure
 from gpmpc.metrics import tracking_error
 from gpmpc.mpc import Problem, Tracking
 from gpmpc.mpc.baselines import NMPC
@@ -155,6 +155,19 @@ def test_without_any_measurement_for_a_moment_both_plans_go_on():
     assert distance(flight) < 0.5
     with pytest.raises(SolverFailure, match="step 2: the state is not finite"):
         fly(Elliptical(), 5, disturbances=[Dropout(2.0, 2.1)])
+
+
+def test_a_cascade_that_diverges_keeps_what_was_flown():
+    class Fleeing(Coupled):
+        def derivative(self, x, u):
+            return [1e35, *super().derivative(x, u)[1:]]
+
+    gone = [Replaced(System(Fleeing(), 0.05, 1), start=0.2)]
+    with pytest.raises(Diverged) as caught:
+        fly(Elliptical(), 2, disturbances=gone)
+    flown = caught.value.rollout
+    assert caught.value.step == len(flown.inputs) == len(flown.inner.inputs) == 4
+    assert len(flown.outer.inputs) == 1
 
 
 def test_a_seed_repeats_a_flight_and_inner_steps_are_reported():

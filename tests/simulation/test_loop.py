@@ -7,8 +7,9 @@ import torch
 from gpmpc.exceptions import Diverged, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
+from gpmpc.models import KnownModel
 from gpmpc.mpc import Decision, Reference, Timing
-from gpmpc.propagation import MomentMatching
+from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import (
     Dropout,
     Gust,
@@ -173,7 +174,7 @@ def test_a_gust_moves_a_plant_without_derivative():
         for x, u in zip(flight.states[:-1], flight.inputs, strict=True)
     ]
     pushes = flight.states[1:] - np.array(free)
-    assert np.allclose(pushes[5:10], [0.0, 2.0], atol=1e-12)
+    assert np.allclose(pushes[5:10], [0.0, 2.0 * 0.1], atol=1e-12)  # a rate, by step
     assert np.abs(np.delete(pushes, range(5, 10), axis=0)).max() == 0
 
 
@@ -343,6 +344,19 @@ def test_a_plant_that_leaves_the_finite_numbers_is_said_so():
     assert caught.value.rollout is None
 
 
+def test_a_belief_that_overflows_diverges_and_keeps_what_was_flown():
+    unstable = KnownModel(lambda x, u: 1e3 * x + u, 2, 1)
+
+    class Regulator(Feedback):
+        def control(self, belief, reference, previous=None):
+            decision = super().control(belief, reference, previous)
+            return replace(decision, input=np.array([-1e3 * float(belief.mean[0])]))
+
+    with pytest.raises(Diverged, match="belief cannot be carried on") as caught:
+        fly(96, Regulator(), ModelLoop(unstable, Linearization()), [0.0, 0.0])
+    assert len(caught.value.rollout.inputs) == caught.value.step > 45
+
+
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
@@ -393,6 +407,16 @@ def test_a_plant_that_leaves_the_finite_numbers_is_said_so():
             ShapeError,
             "replaced by one of the same states",
         ),
+        (
+            {"initial": Gaussian(torch.zeros(2), -0.01 * torch.eye(2))},
+            SettingError,
+            "initial.covariance: must have variances of zero or more",
+        ),
+        (
+            {"initial": Gaussian(torch.zeros(2), torch.full((2, 2), torch.nan))},
+            SettingError,
+            "initial.covariance: must hold finite real numbers",
+        ),
     ],
 )
 def test_misuse_is_refused_with_the_rule(settings, error, message):
@@ -415,6 +439,8 @@ def test_misuse_is_refused_with_the_rule(settings, error, message):
         (lambda: Gust({"v": "strong"}), "rates.v: must be a number; got 'strong'"),
         (lambda: Gust({}), "rates: must map names of states to numbers"),
         (lambda: Dropout(1.0, 1.0), "stop: must be a number above 1.0"),
+        (lambda: Dropout(1, 2, entries=0), "entries: must be a list .*; got 0"),
+        (lambda: Dropout(1, 2, entries=[]), r"entries: must be a list .*; got \[\]"),
         (
             lambda: ModelLoop(None, None, time_step=-1),
             r"time_step: must be a number above 0 \[s\]; got -1",
@@ -434,7 +460,8 @@ def test_a_gust_on_a_simulator_is_refused_with_what_is_possible():
             return [x[0], x[1]]
 
     with pytest.raises(UnsupportedModel, match="Possible with any plant: Replaced"):
-        fly(plant=System(UnderWay(), 0.1), disturbances=[Gust({"v": 1.0})])
+        # in its window or not: before the first step
+        fly(plant=System(UnderWay(), 0.1), disturbances=[Gust({"v": 1.0}, start=99.0)])
     with pytest.raises(
         SettingError,
         match=r"system: must be a plant, such as System\(dynamics, 0.1\).*got UnderWay",

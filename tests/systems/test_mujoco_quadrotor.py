@@ -46,6 +46,11 @@ def test_wind_pushes_by_drag_and_thrusts_may_act_late():
     windy = mujoco_quadrotor(wind=(4.0, 0.0, 0.0), substeps=1)
     state = step(windy, windy.dynamics.reset(0), np.array(windy.initial_input))
     assert state[1] == pytest.approx(0.25 * 4 / 0.5 * 0.005, rel=0.01)
+    lifted = mujoco_quadrotor(wind=(0.0, 0.0, 2.0))
+    state = lifted.dynamics.reset(0)
+    for _ in range(600):  # 24 s
+        state = step(lifted, state, np.array(lifted.initial_input))
+    assert state[5] == pytest.approx(2.0, abs=0.01)  # as fast as the air
     late = mujoco_quadrotor(input_delay=2)
     state = late.dynamics.reset(0)
     speeds = []

@@ -12,10 +12,16 @@ from gpmpc.exceptions import DataError, Diverged, SettingError
 from gpmpc.gp import Trainer, standardize
 from gpmpc.mpc import GPMPC, Box, Decision, Problem, Timing, Tracking
 from gpmpc.propagation import Linearization
-from gpmpc.simulation import closed_loop, closed_loops
+from gpmpc.simulation import Noise, Replaced, closed_loop, closed_loops
 from gpmpc.status import Status
 from gpmpc.studies.flight import Experiment, run_trial
-from gpmpc.systems import cart_pole, planar_quadrotor, step, step_many
+from gpmpc.systems import (
+    cart_pole,
+    double_integrator,
+    planar_quadrotor,
+    step,
+    step_many,
+)
 from gpmpc.systems.gymnasium_ import (
     OURS,
     gymnasium_system,
@@ -147,11 +153,14 @@ class Pushing:
     horizon = 1
     initial_input = (1.0,)
 
+    def __init__(self, input=1.0):
+        self.input = input
+
     def control(self, belief, reference, previous=None):
         n = len(belief.mean)
         return Decision(
-            [1.0],
-            np.ones((1, 1)),
+            [self.input],
+            np.full((1, 1), self.input),
             np.zeros((2, n)),
             np.zeros((2, n, n)),
             Status.SOLVED,
@@ -171,6 +180,36 @@ def test_an_episode_that_ends_is_a_lost_flight():
     assert np.abs(caught.value.rollout.states[-1, 0]) < 10
     with pytest.raises(SettingError, match="a simulator flies one seed after another"):
         closed_loops(system, Pushing(), np.zeros((3, 2)), None, 2, seeds=2)
+    later = [Replaced(system, start=1e3)]
+    plant = double_integrator()
+    with pytest.raises(SettingError, match="a simulator flies one seed after another"):
+        closed_loops(
+            plant,
+            Pushing(),
+            np.zeros((3, 2)),
+            [0.0, 0.0],
+            2,
+            seeds=2,
+            disturbances=later,
+        )
+
+
+def test_a_simulator_is_an_environment_that_starts_where_it_starts():
+    environment = make_environment(pendulum_environment())
+    start, _ = environment.reset(seed=1)
+    after = environment.step(np.zeros(1))[0]
+    assert not np.array_equal(after, start)
+    assert not np.array_equal(environment.reset()[0], start)
+    with pytest.raises(SettingError, match="must be a name where settings are given"):
+        make_environment(planar_quadrotor(), mass=2.0)
+
+
+def test_inputs_of_joints_are_recorded_within_what_they_are_clipped_to(cart):
+    joints = mujoco_system(cart, ["push"], joints=["slider", "hinge"])
+    flight = closed_loop(
+        joints, Pushing(20.0), np.zeros((4, 4)), np.zeros(4), 2, noise=Noise(input=[1])
+    )
+    assert np.array_equal(flight.inputs, [[10.0], [10.0]])
 
 
 def test_a_limit_of_steps_that_was_asked_for_ends_the_episode():

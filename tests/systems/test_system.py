@@ -17,6 +17,8 @@ from gpmpc.systems import (
     coupled,
     double_integrator,
     double_pendulum,
+    dynamic_bicycle,
+    kinematic_bicycle,
     pendulum,
     planar_quadrotor,
     rotational,
@@ -245,6 +247,24 @@ def test_misuse_is_refused_where_the_system_is_made(settings, error, message):
     }
     with pytest.raises(error, match=message):
         System(**(defaults | settings))
+
+
+def test_a_car_at_rest_is_not_turned_and_backwards_it_turns_the_other_way():
+    car = dynamic_bicycle().dynamics
+    assert car.derivative([0.0] * 6, [0.3, 0.0]) == pytest.approx([0.0] * 6)
+    forwards = car.derivative([0.0, 0.0, 0.0, 2.0, 0.0, 0.0], [0.3, 0.0])
+    backwards = car.derivative([0.0, 0.0, 0.0, -2.0, 0.0, 0.0], [0.3, 0.0])
+    assert backwards[4:] == pytest.approx([-rate for rate in forwards[4:]])
+    assert forwards[5] > 10
+
+
+def test_curvature_is_of_a_unit_of_steering():
+    scale = np.pi / 180  # steering in degrees
+    car = kinematic_bicycle(curvature=scale / 0.3, steering_scale=scale).dynamics
+    yaw_rate = car.derivative([0.0, 0.0, 0.0, 1.0], [10.0, 0.0])[2]
+    assert yaw_rate == pytest.approx(np.tan(10 * scale) / 0.3)
+    with pytest.raises(SettingError, match=r"steering_scale: must be a number above 0"):
+        kinematic_bicycle(steering_scale=0.0)
 
 
 def test_a_trajectory_of_another_number_of_positions_is_refused():
