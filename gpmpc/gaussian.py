@@ -175,7 +175,9 @@ def nearest_positive_semidefinite(covariance: Tensor) -> tuple[Tensor, Tensor]:
     """Projects matrices (*batch, n, n) to the nearest positive semidefinite ones.
 
     They are nearest in the Frobenius norm (Higham, 1988), and symmetric. Where the
-    symmetrised matrix is positive semidefinite already it is returned unchanged.
+    symmetrised matrix is positive semidefinite already it is returned unchanged. The
+    projection carries its first derivative, in which eigenvalues below zero by no more
+    than round-off count as zero or more; second derivatives of it are not provided.
 
     Returns:
         The matrices, and how far below zero the smallest eigenvalue was (*batch,).
@@ -193,16 +195,44 @@ def nearest_positive_semidefinite(covariance: Tensor) -> tuple[Tensor, Tensor]:
         failed = torch.linalg.cholesky_ex(symmetric).info.any()
         if not bool(failed):
             return symmetric, torch.zeros_like(symmetric[..., 0, 0])
-    deficit = (-torch.linalg.eigvalsh(symmetric.detach())[..., 0]).clamp_min(0)
+    constant = symmetric.detach()
+    deficit = (-torch.linalg.eigvalsh(constant)[..., 0]).clamp_min(0)
     negative = deficit[..., None, None] > 0
-    # The derivative of eigh divides by differences of eigenvalues; where nothing is
-    # projected it gets distinct ones.
-    distinct = torch.arange(
-        1, symmetric.shape[-1] + 1, dtype=symmetric.dtype, device=symmetric.device
-    ).diag()
-    eigenvalues, vectors = torch.linalg.eigh(torch.where(negative, symmetric, distinct))
-    projected = vectors @ (eigenvalues.clamp_min(0)[..., None] * vectors.mT)
-    return torch.where(negative, (projected + projected.mT) / 2, symmetric), deficit
+    eigenvalues, vectors = torch.linalg.eigh(constant)
+    kept = eigenvalues.clamp_min(0)
+    projected = vectors @ (kept[..., None] * vectors.mT)
+    projected = (projected + projected.mT) / 2
+    # It is zero, and carries the derivative: autograd through the eigendecomposition
+    # would divide by differences of eigenvalues, which may be equal.
+    change = _projection_differential(eigenvalues, vectors, symmetric - constant)
+    return torch.where(negative, projected + change, symmetric), deficit
+
+
+def _projection_differential(
+    eigenvalues: Tensor, vectors: Tensor, change: Tensor
+) -> Tensor:
+    """Returns the change of U diag(max(b, 0)) U' with that of U diag(b) U'.
+
+    In the eigenbasis entry ij of the change is weighed by the slope of max(b, 0)
+    between b_i and b_j (Daleckii and Krein, 1965): 1 where both are kept, 0 where none
+    is, b_i / (b_i - b_j) where b_i alone is.
+
+    Args:
+        eigenvalues: b (*batch, n).
+        vectors: U (*batch, n, n).
+        change: Of the matrix (*batch, n, n).
+    """
+    n = eigenvalues.shape[-1]
+    largest = eigenvalues.abs().amax(-1, keepdim=True)
+    round_off = n * torch.finfo(eigenvalues.dtype).eps * largest
+    is_kept = eigenvalues >= -round_off
+    kept = torch.where(is_kept, eigenvalues.clamp_min(0), 0.0)
+    from_zero = torch.where(is_kept, kept, -eigenvalues)
+    kept_sum = kept[..., :, None] + kept[..., None, :]
+    total = from_zero[..., :, None] + from_zero[..., None, :]
+    positive = total > 0
+    slope = torch.where(positive, kept_sum / torch.where(positive, total, 1.0), 1.0)
+    return vectors @ (slope * (vectors.mT @ change @ vectors)) @ vectors.mT
 
 
 def square_root(covariance: Tensor) -> Tensor:

@@ -40,5 +40,26 @@ def test_a_semidefinite_matrix_is_returned_unchanged():
     assert float(deficit) == 0
 
 
+@pytest.mark.parametrize(
+    "eigenvalues", [(2.0, 2.0, 0.5, -1.0, -1.0), (1.0, 0.0, 0.0, -1e-18)]
+)
+def test_the_projection_has_its_slope_beside_equal_eigenvalues(eigenvalues):
+    generator = torch.Generator().manual_seed(2)
+    b = torch.tensor(eigenvalues, dtype=torch.float64)
+    n = len(b)
+    U = torch.eye(n, dtype=torch.float64)
+    if min(eigenvalues) < -0.1:
+        U, _ = torch.linalg.qr(torch.randn(n, n, generator=generator).double())
+    matrix = (U @ b.diag() @ U.mT).requires_grad_()
+    weights = torch.randn(n, n, generator=generator).double()
+    projected, _ = nearest_positive_semidefinite(matrix)
+    (slope,) = torch.autograd.grad((weights * projected).sum(), matrix)
+    change = torch.randn(n, n, generator=generator).double()
+    change = 1e-6 * (change @ change.mT)  # what is zero becomes no less
+    moved, _ = nearest_positive_semidefinite(matrix.detach() + change)
+    expected = float((weights * (moved - projected.detach())).sum())
+    assert float((slope * change).sum()) == pytest.approx(expected, rel=1e-4)
+
+
 def test_an_array_that_is_read_backwards_is_a_state():
     assert Gaussian.certain(np.arange(3.0)[::-1]).mean.tolist() == [2.0, 1.0, 0.0]

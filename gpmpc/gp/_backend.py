@@ -26,11 +26,14 @@ _chosen: ContextVar[_Backend] = ContextVar("backend", default="auto")
 def backend(choice: _Backend) -> Iterator[None]:
     """Forces ``"compiled"`` or ``"torch"`` within a ``with`` block.
 
-    ``"auto"`` leaves the choice to each call.
+    ``"auto"`` leaves the choice to each call. It concerns what compiled loops are made
+    for: ``linearize`` and ``rollout`` of models of GPs, ``differentiate``, and moment
+    matching. Single predictions, sampling and models without such loops are torch's
+    under any choice. Threads that are started in the block begin with ``"auto"``.
 
     Raises:
-        SettingError: Another word; within the block, ``"compiled"`` where only torch
-            can evaluate.
+        SettingError: Another word; within the block, ``"compiled"`` where there is such
+            a loop and only torch can evaluate the numbers.
 
     See Also:
         ``gpmpc.mpc.GPMPC``, whose decisions are compiled by default.

@@ -29,6 +29,8 @@ _REMEDY = (
 def exact_inference() -> Iterator[None]:
     """Keeps GPyTorch on the exact Cholesky factorisation in a ``with`` block.
 
+    GPyTorch's settings are of the whole process: one thread at a time may be in it.
+
     See Also:
         ``to_gpytorch``, whose predictions it keeps exact.
     """

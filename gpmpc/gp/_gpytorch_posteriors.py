@@ -219,12 +219,13 @@ class _FrozenModel:
         size = self.features.shape[-2]
         expanded = query.expand(*self.features.shape[:-2], -1, -1)
         joined = torch.cat([self.features, expanded], dim=-2)
-        with exact_inference():
-            # Lazy: only the two blocks below are evaluated.
-            prior = self.model.forward(joined)
-            covariance = prior.lazy_covariance_matrix
-            k = covariance[..., :size, size:].to_dense()  # (*k, N, B)
-            own = covariance[..., size:, size:].diagonal(dim1=-2, dim2=-1)
+        # Nothing but the prior is asked, which depends on none of GPyTorch's settings.
+        # These are of the whole process: other threads may be at work with them.
+        prior = self.model.forward(joined)
+        # Lazy: only the two blocks below are evaluated.
+        covariance = prior.lazy_covariance_matrix
+        k = covariance[..., :size, size:].to_dense()  # (*k, N, B)
+        own = covariance[..., size:, size:].diagonal(dim1=-2, dim2=-1)
         whitened = torch.linalg.solve_triangular(self.cholesky, k, upper=False)
         mean = prior.mean[..., size:] + (self.weights[..., None] * k).sum(-2)
         variance = (own - whitened.square().sum(-2)).clamp_min(0)

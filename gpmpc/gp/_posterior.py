@@ -218,9 +218,16 @@ class GPPosterior(TensorModel):
         """
         return torch.diag(self.noise_variance)
 
-    @cached_property
+    @property
     def precision(self) -> Tensor:
         """(K + sn2 I)^-1 (k, N, N)."""
+        # computed within no_grad it would stay without a graph
+        if self.cholesky.requires_grad:
+            return torch.cholesky_inverse(self.cholesky)
+        return self._constant_precision
+
+    @cached_property
+    def _constant_precision(self) -> Tensor:
         return torch.cholesky_inverse(self.cholesky)
 
     @cached_property
@@ -249,9 +256,12 @@ class GPPosterior(TensorModel):
             self.cholesky,
         )
 
-    @cached_property
+    @property
     def on_host(self) -> bool:
-        """Whether compiled loops can evaluate it: constant float64 in host memory."""
+        """Whether compiled loops can evaluate it: constant float64 in host memory.
+
+        It is asked each time: within ``torch.no_grad`` everything is constant.
+        """
         is_constant = constant_arrays(*self.prediction_tensors) is not None
         return is_constant and self.dtype is torch.float64
 

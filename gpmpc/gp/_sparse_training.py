@@ -192,8 +192,10 @@ class SparseTrainer:
         )
 
         best = bound.unpack(torch.from_numpy(best_vector))
+        # as the posterior holds them: far from zero, restoring them rounds
+        inducing = scaling.scale(scaling.restore(best.inducing))
         scaled_posterior = sparse_posterior(
-            best.inducing,
+            inducing,
             x,
             y,
             Hyperparameters.from_theta(best.theta),
@@ -371,7 +373,7 @@ def informative_points(
     """
     check_number("count", count, least=0, whole=True)
     lengthscales, signal_variance, noise_variance = hyperparameters
-    round_off = 1e-10 * signal_variance
+    round_off = max(1e-10, 100 * torch.finfo(features.dtype).eps) * signal_variance
     unexplained = signal_variance[:, None].repeat(1, len(features))
     most = min(count, len(features))
     rows = features.new_zeros(len(lengthscales), most, len(features))

@@ -211,6 +211,21 @@ def matern_dynamics(predicts="next_state", size=40):
     )
 
 
+def test_predicting_leaves_gpytorchs_settings_to_the_process(monkeypatch):
+    """Other threads read them at the same time."""
+    gp = matern_dynamics()
+    forward = gp.parts[0].model.forward
+    sizes = []
+
+    def watched(points):
+        sizes.append(gpytorch.settings.max_cholesky_size.value())
+        return forward(points)
+
+    monkeypatch.setattr(gp.parts[0].model, "forward", watched)
+    gp.predict(torch.zeros(2), torch.zeros(1))
+    assert sizes == [gpytorch.settings.max_cholesky_size.value()]
+
+
 def test_leading_batch_dimensions_are_those_of_the_query():
     gp = matern_dynamics()
     x = torch.rand(2, 3, 2)

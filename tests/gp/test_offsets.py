@@ -79,6 +79,18 @@ def assert_same_training(trainer, x, y, by, targets_by=0.0):
         assert torch.allclose(slope, their_slope, rtol=0, atol=1e-2)
 
 
+def test_inducing_points_are_rounded_before_they_are_factorised():
+    """They are found around zero, and kept where the data lie."""
+    generator = torch.Generator().manual_seed(0)
+    x = on_grid(torch.randn(60, 1, generator=generator))
+    y = torch.sin(2 * x) + 1e-2 * torch.randn(x.shape, generator=generator)
+    trainer = SparseTrainer(inducing=15, restarts=0, iterations=10)
+    here = trainer.fit(x, y, 0, "value").posterior.predict(x)
+    there = trainer.fit(x + 1e9, y, 0, "value").posterior.predict(x + 1e9)
+    assert torch.allclose(there.mean, here.mean, rtol=0, atol=1e-8)
+    assert torch.allclose(there.variance, here.variance, rtol=1e-6)
+
+
 @pytest.mark.parametrize("by", FEATURES, ids=str)
 @pytest.mark.parametrize("name", TRAINERS)
 def test_training_does_not_see_where_the_features_lie(name, by):

@@ -263,6 +263,9 @@ def test_informative_points_differ_and_end_with_the_information():
     assert (
         len(informative_points(x[[0, 1, 0, 1, 0]], Hyperparameters(**settings), 5)) == 2
     )
+    in_float32 = [value.float() for value in settings.values()]
+    points = x[:4].float().repeat(5, 1)
+    assert sorted(informative_points(points, in_float32, 20)) == [0, 1, 2, 3]
     random = [
         collapsed_bound(
             x[i : i + 30], x, problem(100)[1], Hyperparameters(**settings)

@@ -217,6 +217,32 @@ def test_nobody_has_derivatives_too():
             assert d.covariance_by_covariance.shape == (0, 3, 3, 3, 3)
 
 
+@pytest.mark.parametrize("in_graph", [True, False])
+def test_gradients_of_hyperparameters_outlive_a_look_without_any(in_graph):
+    gp = MODELS["next state"]
+    nobody = Gaussian(torch.zeros(3), 0.1 * torch.eye(3))
+    control = torch.zeros(2)
+
+    def slopes(look_first):
+        noise = gp.noise_variance.clone().requires_grad_(in_graph)
+        again = GPPosterior.from_hyperparameters(
+            gp.features,
+            gp.targets,
+            gp.lengthscales,
+            gp.signal_variance,
+            noise,
+            input_dim=2,
+        )
+        leaf = noise if in_graph else again.weights
+        if look_first:
+            linearize(MomentMatching(), again, nobody, control)
+        leaf.requires_grad_()
+        moments = MomentMatching()(again, nobody, control)
+        return torch.autograd.grad(moments.covariance.sum(), leaf)[0]
+
+    assert torch.equal(slopes(look_first=True), slopes(look_first=False))
+
+
 def test_a_forced_evaluation_refuses_what_it_cannot_do():
     gp = MODELS["next state"]
     state = torch.zeros(3)
