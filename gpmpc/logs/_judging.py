@@ -186,7 +186,7 @@ def _judge_windows(
         learned: From ``learn``.
         train: To which the baselines are fitted.
         windows: Of held-out runs.
-        steps: After the starts.
+        steps: After the starts, increasing.
         names: Of the held-out runs.
         longest: Steps of the longest prediction, also of other windows.
     """
@@ -213,7 +213,7 @@ def _judge_windows(
         width=np.sqrt(claimed / np.maximum(actual, 1e-300)),
         windows=(len(windows),) * len(steps),
         comparisons=_comparisons(distances, windows, steps, longest),
-        runs=tuple(names[number] for number in np.unique(windows.runs)),
+        runs=tuple(name for number, name in enumerate(names) if number in windows.runs),
     )
 
 

@@ -120,7 +120,8 @@ class Search:
             log, folds, self._fits, past_rows, steps, self.judged_steps
         )
         self._structures: dict[str, Structure] = {}
-        self._errors: dict[str, Array] = {}  # means, by the structure's key
+        # Means by the structure's key; of those with a correction, estimates.
+        self._errors: dict[str, Array] = {}
         self._simulation: FreeSimulation | None = None
         if not for_control:
             self._simulation = FreeSimulation.of(folds, past_rows, steps)
@@ -142,12 +143,20 @@ class Search:
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
-        """All structures that were considered, in order; the best one is chosen."""
+        """All structures that were considered, in order; the best one is chosen.
+
+        Those with a correction were ranked by an estimate. Here their errors are
+        measured, on the rows of all others.
+        """
         best = self.best
-        return tuple(
-            Candidate(structure.name, self._errors[key], structure is best)
-            for key, structure in self._structures.items()
-        )
+        candidates = []
+        for key, structure in self._structures.items():
+            errors = self._errors[key]
+            if structure.correction_shares:
+                models = self._validations.corrected_models(structure)
+                errors = self._held_out.mean(models)
+            candidates.append(Candidate(structure.name, errors, structure is best))
+        return tuple(candidates)
 
     def run(self) -> None:
         """Considers all structures."""

@@ -231,6 +231,13 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
     train, held_out = log.split(["run 2"])
     learned = learn(train, points=40, steps=20)
     assert not judge(learned, held_out, train, steps=(1, 10)).losses
+    # What is said of a corrected candidate was measured, as what it won by was.
+    errors = {one.name: one.errors for one in learned.candidates}
+    (chosen,) = (one for one in learned.candidates if one.chosen)
+    second = learned.comparisons[-1]
+    assert "corrected by the past" in chosen.name
+    ratio = chosen.errors[:, 1] / errors[second.name][:, 1]
+    np.testing.assert_allclose(ratio, second.ratio[:, 1])
     for steps in ((10, 1), (1, 1)):
         with pytest.raises(SettingError, match="steps: must increase"):
             judge(learned, held_out, train, steps=steps)
