@@ -7,7 +7,6 @@ Those that a user gives may call anything; those out of a file are checked first
 
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.util import find_spec
 from typing import Any
 
 from hydra.utils import instantiate
@@ -15,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.cli._folders import folder_of
+from gpmpc.cli._mlflow import check_tracker
 from gpmpc.cli._plain_settings import plain_data
 from gpmpc.cli._recorded_settings import checked_settings
 from gpmpc.exceptions import SettingError, check_number
@@ -44,7 +44,11 @@ _CHOICES = {
 
 
 def experiment_of(config: DictConfig) -> Experiment:
-    """Makes the objects that a user's settings describe; they may call anything."""
+    """Makes the objects that a user's settings describe; they may call anything.
+
+    What is flown is tracked: what a file describes is not.
+    """
+    check_tracker(config.get("tracker"))
     return _build(_merge(DictConfig(plain_data(config))))
 
 
@@ -217,8 +221,6 @@ def _check(config: DictConfig) -> None:
         if config[key] is not None and config[key] not in values:
             names = " or ".join(map(repr, values))
             raise SettingError(key, f"must be {names}; got {config[key]!r}")
-    if config.tracker == "mlflow" and find_spec("mlflow") is None:
-        raise SettingError("tracker", "needs MLflow: pip install mlflow")
     if config.live and config.recorder != "mcap":
         raise SettingError(
             "live", f"needs recorder=mcap; got recorder={config.recorder}"

@@ -25,6 +25,7 @@ from joblib.externals.loky import ProcessPoolExecutor
 from joblib.externals.loky.backend import resource_tracker
 from omegaconf import DictConfig, OmegaConf
 
+from gpmpc.cli._terminal import OutputEnded
 from gpmpc.exceptions import GpmpcError, SettingError, check_number
 from gpmpc.parallel import children_ignore_interrupts, end_with
 from gpmpc.studies._run_folder import RunFolder
@@ -179,6 +180,8 @@ class Basic:
         for chunk in chunks:
             try:
                 work(chunk)
+            except OutputEnded:  # the command ends, and no run has failed
+                raise
             except (Exception, SystemExit) as error:
                 yield _end_by(error, chunk)
             else:

@@ -48,6 +48,8 @@ def log(arguments: argparse.Namespace) -> Result:
     """Does with a recording what was asked for."""
     action = arguments.action
     file = arguments.file
+    if action != "inspect":
+        _check_of_recording(arguments)
     if action == "info":
         if arguments.output:
             raise GpmpcError(f"log info: writes nothing; got {arguments.output}")
@@ -60,6 +62,16 @@ def log(arguments: argparse.Namespace) -> Result:
     if action == "layout":
         return _layout(file, output)
     return _export(file, output)
+
+
+def _check_of_recording(arguments: argparse.Namespace) -> None:
+    """Raises ``GpmpcError`` where an option is given that only ``inspect`` takes."""
+    for option in ("mapping", "time", "time_step"):
+        if getattr(arguments, option) not in (None, ""):
+            name = option.replace("_", "-")
+            raise GpmpcError(
+                f"--{name}: is for log inspect; got log {arguments.action}"
+            )
 
 
 def _output(action: str, file: Path, chosen: Path | None) -> Path:

@@ -132,7 +132,7 @@ def _run_with_settings(
     flies_many = name == "tune" or getattr(arguments, "multirun", False)
     with settings_folders(arguments.config_dir):
         if arguments.help:
-            print(help_text(name))
+            print(help_text(arguments.config_name, arguments.config_dir))
             return Result()
         if not arguments.cfg:
             find_modules_here()

@@ -1,15 +1,54 @@
-"""Writes finished runs to MLflow."""
+"""Writes finished runs to MLflow, each result once.
+
+A file of the run's folder says which result is there already.
+"""
 
 import math
 import os
 import re
 from collections.abc import Mapping
+from hashlib import sha256
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from gpmpc._files import write_whole
 from gpmpc._provenance import flattened
+from gpmpc.cli._mistakes import one_line
+from gpmpc.cli._terminal import print_error
+from gpmpc.exceptions import SettingError
+from gpmpc.studies._run_folder import METRICS, RunFolder
 
 _LONGEST_PARAMETER = 6000  # characters that MLflow takes
+_WRITTEN = ".mlflow"  # holds digits of the metrics.json that is in MLflow
+
+
+def check_tracker(tracker: str | None) -> None:
+    """Raises ``SettingError`` where runs cannot be tracked here as it is set."""
+    if tracker == "mlflow" and find_spec("mlflow") is None:
+        raise SettingError("tracker", "needs MLflow: pip install mlflow")
+
+
+def track(folder: RunFolder, result: Mapping[str, Any]) -> bool:
+    """Writes a finished run to MLflow, unless it is there.
+
+    Where that fails, the run stays finished, and a line says so.
+
+    Returns:
+        Whether it is there.
+    """
+    path = folder.path
+    try:
+        digits = sha256((path / METRICS).read_bytes()).hexdigest()
+        written = path / _WRITTEN
+        if written.exists() and written.read_text() == digits:
+            return True
+        log_to_mlflow(path, result)
+        write_whole(written, digits, flush=False)
+    except Exception as error:
+        print_error(f"{path} is not in MLflow: {one_line(error)}")
+        return False
+    return True
 
 
 def log_to_mlflow(folder: Path, result: Mapping[str, Any]) -> None:

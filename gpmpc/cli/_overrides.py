@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from gpmpc.cli._plain_settings import ASIDE
@@ -129,7 +130,10 @@ def combinations(overrides: Sequence[str]) -> Iterator[list[str]]:
             all runs share.
     """
     by_key: dict[str, list[str]] = {}
-    for override in OverridesParser.create().parse_overrides([*overrides]):
+    hydra = GlobalHydra.instance()
+    # knows the options that glob(*) stands for
+    loader = hydra.config_loader() if hydra.is_initialized() else None
+    for override in OverridesParser.create(loader).parse_overrides([*overrides]):
         key = override.get_key_element()
         if not override.is_sweep_override():
             by_key[key] = [str(override.input_line)]

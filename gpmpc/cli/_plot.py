@@ -42,7 +42,7 @@ def plot(arguments: argparse.Namespace) -> Result:
                 print_error(one_line(error))
                 code = 2
                 continue
-            print_error(f"{path}: {type(error).__name__}: {one_line(error)}")
+            print_error(f"{path}: {one_line(error)}")
             code = max(code, 1)
     return Result({"runs": plotted}, code)
 

@@ -23,7 +23,7 @@ from gpmpc.cli._commands import Result
 from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import folder_of, writing
 from gpmpc.cli._mistakes import one_line
-from gpmpc.cli._mlflow import log_to_mlflow
+from gpmpc.cli._mlflow import track
 from gpmpc.cli._overrides import choices, folder_choice
 from gpmpc.cli._plain_settings import plain_settings
 from gpmpc.cli._settings import config_source_options, run_command
@@ -101,6 +101,9 @@ def run(config: DictConfig) -> Result:
         # folder.
         experiment_of(config)
         hydra_settings = HydraConfig.get()
+        launcher = (hydra_settings.launcher or {}).get("name", "basic")
+        if launcher != "basic":
+            print_error(f"launcher={launcher} is for sweeps (-m); this run flies here")
         overrides = hydra_settings.overrides.task
         own_choices = choices(overrides)
         to_fly = RunToFly(
@@ -188,7 +191,10 @@ def run_one(to_fly: RunToFly, wait: bool = True, warn: Warn | None = None) -> Ou
     folder = to_fly.folder
     settings = plain_settings(config, to_fly.options)
     if folder.finished and not config.live:  # in a folder that may only be read, too
-        return Outcome(folder.path, folder.result(settings), skipped=True)
+        result = folder.result(settings)
+        if config.tracker == "mlflow":  # a run that was flown without, or not taken
+            track(folder, result)
+        return Outcome(folder.path, result, skipped=True)
     if wait and folder.state is RunState.RUNNING:
         print_error(f"waiting for {folder.last_worker}, which flies {folder.path}")
     with writing(folder.path), folder.locked(wait):
@@ -221,16 +227,8 @@ def run_one(to_fly: RunToFly, wait: bool = True, warn: Warn | None = None) -> Ou
                 mistake=isinstance(error, _MISTAKES),
             )
         if config.tracker == "mlflow":
-            _track(folder, result)
+            track(folder, result)
     return Outcome(folder.path, result)
-
-
-def _track(folder: RunFolder, result: Mapping[str, Any]) -> None:
-    """Writes a finished run to MLflow; where that fails, the run stays finished."""
-    try:
-        log_to_mlflow(folder.path, result)
-    except Exception as error:
-        print_error(f"{folder.path} is not in MLflow: {one_line(error)}")
 
 
 def _was_interrupted(error: BaseException | None) -> bool:

@@ -17,7 +17,6 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 import gpmpc
 from gpmpc.exceptions import SettingError
 
-# Of files of models, quoted or not.
 # Of files of models, those of gpmpc 1 included, in quotes or without.
 _MODEL_ENDINGS = tuple(
     f"{ending}{quote}"
@@ -153,28 +152,41 @@ def _dotted_keys(node: object, prefix: str = "") -> list[str]:
     return keys
 
 
-def group_options(name: str) -> dict[str, list[str]]:
-    """Returns the options of every group that ``conf/NAME.yaml`` chooses from."""
+def group_options(name: str, own: str | None = None) -> dict[str, list[str]]:
+    """Returns the options of every group that ``NAME.yaml`` chooses from.
+
+    Args:
+        name: Of a file in ``conf/``, or else in ``own``.
+        own: The folder of ``--config-dir``.
+    """
     get_options = GlobalHydra.instance().config_loader().get_group_options
     groups = []
     other_files = []
-    for entry in OmegaConf.load(config_folder() / f"{name}.yaml").defaults:
+    file = config_folder() / f"{name}.yaml"
+    if own is not None and not file.exists():
+        file = Path(own) / f"{name}.yaml"
+    settings: Any = OmegaConf.load(file)
+    for entry in settings.get("defaults", ()):
         if OmegaConf.is_dict(entry):
             groups += [key for key in entry if not key.startswith("override ")]
         elif isinstance(entry, str) and entry != "_self_":
             other_files.append(entry)
     options = {group: get_options(group.partition("@")[0]) for group in sorted(groups)}
     for other in other_files:
-        options |= group_options(other)
+        options |= group_options(other, own)
     return options
 
 
-def help_text(name: str) -> str:
-    """Returns what ``gpmpc COMMAND --help`` prints: use, choices and settings."""
-    choices = "\n".join(
-        f"{key}: {', '.join(options)}" for key, options in group_options(name).items()
-    )
+def help_text(name: str, own: str | None = None) -> str:
+    """Returns what ``gpmpc COMMAND --help`` prints: use, choices and settings.
+
+    Arguments are those of ``group_options``.
+    """
     every = OmegaConf.to_yaml(compose(name))
+    choices = "\n".join(
+        f"{key}: {', '.join(options)}"
+        for key, options in group_options(name, own).items()
+    )
     header = HydraConfig.get().help.header
     return (
         f"{header}\n\nChoices:\n\n{choices}\n\n"

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import hydra
+from hydra.core.hydra_config import HydraConfig
 from rich.console import Console
 
 from gpmpc.cli._chunks import Chunking, Job, fly_chunk
@@ -33,6 +34,7 @@ from gpmpc.cli._examples import Examples, try_settings
 from gpmpc.cli._flying import Flying
 from gpmpc.cli._folders import folder_of, write_files
 from gpmpc.cli._launchers import Refused, launcher_of
+from gpmpc.cli._mlflow import check_tracker, track
 from gpmpc.cli._overrides import choices, combinations
 from gpmpc.cli._plain_settings import plain_settings
 from gpmpc.cli._settings import config_source_options
@@ -73,6 +75,8 @@ class Sweep:
 
     def __init__(self, name: str, overrides: Sequence[str], console: Console):
         self.config = hydra.compose(name, [*overrides], return_hydra_config=True)
+        HydraConfig.instance().set_config(self.config)  # settings may ask Hydra
+        check_tracker(self.config.get("tracker"))
         self.tree = folder_of(self.config.folder)
         self.console = console
         self._composer = Composer(name, self.config)
@@ -163,6 +167,7 @@ class Sweep:
 
         Those that another process works on are waited for at the end.
         """
+        self._track_finished(jobs)
         outcomes: list[JobOutcome] = []
 
         def settle(job: Job, state: RunState) -> None:
@@ -181,6 +186,18 @@ class Sweep:
         self.flown_again |= {*flying.tried_again, *flying.repeated}
         self.given_up |= flying.given_up
         return outcomes
+
+    def _track_finished(self, jobs: Sequence[Job]) -> None:
+        """Writes finished runs to MLflow that are not there, if settings say so.
+
+        Where it takes one of them not, it is not asked for the others.
+        """
+        if self.config.get("tracker") != "mlflow":
+            return
+        for job in jobs:
+            folder = job.folder
+            if folder.finished and not track(folder, folder.result()):
+                return
 
     def _print_remarks(self, remarks: Sequence[str]) -> None:
         """Prints what a flight has to say, once for all that differ in numbers."""

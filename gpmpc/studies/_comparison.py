@@ -8,6 +8,7 @@ Wall times are not compared: one group is flown after the other, and what the ma
 did meanwhile is no property of either.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -19,6 +20,8 @@ from scipy import stats
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.studies._runs import SEED, Report, in_order
 
+# Between two choices, behind which the next KEY= begins: values may hold others.
+_COMMA = re.compile(r",(?=[^\s,=\[\]{}'\"]+=)")
 _WALL_TIMES = ("decision", "training")
 _LEVEL = 0.05
 # With n pairs the smallest two-sided p-value of the signed-rank test is 2^(1 - n).
@@ -137,7 +140,7 @@ def _runs_of_group(report: Report, group: str, text: str) -> pd.DataFrame:
     The column ``others`` says what else was varied, and ``seed`` is as it is chosen.
     """
     choices = {}
-    for choice in text.split(","):
+    for choice in _COMMA.split(text):
         key, value = _parse_choice(report, group, choice)
         choices[key] = value
     others = {}

@@ -249,6 +249,12 @@ def test_what_all_runs_share_has_one_value(word):
         combinations(["seed=1,2", word])
 
 
+def test_glob_is_every_option_of_its_group():
+    solvers = [*combinations(["launcher=basic", "solver=glob(*)"])]
+    assert len(solvers) > 1
+    assert ["launcher=basic", "solver=clarabel"] in solvers
+
+
 def test_what_is_gone_or_damaged_is_not_counted_as_flown(tmp_path):
     """A finished folder goes while others fly, and one holds half a result."""
     jobs = jobs_of(tmp_path, "seed=range(3)")

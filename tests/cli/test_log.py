@@ -273,6 +273,7 @@ MISTAKES = [
     ),
     (["layout", "run.mcap", "run.yaml"], "output: must end in .json; got 'run.yaml'"),
     (["show", "run.mcap"], "invalid choice: 'show'"),
+    (["info", "run.mcap", "--time", "t"], "--time: is for log inspect; got log info"),
     (["info"], "the following arguments are required: file"),
     ([], "the following arguments are required: action, file"),
 ]

@@ -10,6 +10,7 @@ from hydra.core.hydra_config import HydraConfig
 from gpmpc.cli import _run
 from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import writing
+from gpmpc.cli._launchers import Basic
 from gpmpc.cli._run import RunToFly, run_one
 from gpmpc.cli._settings import compose, settings_folders
 from gpmpc.cli._terminal import OutputEnded
@@ -89,6 +90,10 @@ def test_a_reader_that_has_seen_enough_makes_no_failed_run(tmp_path, monkeypatch
     with pytest.raises(OutputEnded):
         run_one(run)
     assert run.folder.state is RunState.ABANDONED
+    # nor does a sweep in this process go on
+    with pytest.raises(OutputEnded):
+        [*Basic(tmp_path).launch(lambda _: run_one(run), [SimpleNamespace()])]
+    assert run.folder.failed_at is None
 
 
 def test_a_model_that_cannot_be_read_is_no_fault_of_the_folder(tmp_path):

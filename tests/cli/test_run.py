@@ -128,7 +128,9 @@ def test_a_flight_is_predicted_or_one_line_says_why_not(tmp_path, monkeypatch, c
     assert 0 <= exported.data["difference_from_flight"] < 1e-6
     said = "was flown by other code: what is exported is what this code makes of"
     assert said in capsys.readouterr().out
-    assert forked("run", *TINY, "steps=3", cwd=tmp_path).returncode == 0
+    here = forked("run", *TINY, "steps=3", "launcher=joblib", cwd=tmp_path)
+    assert here.returncode == 0
+    assert "launcher=joblib is for sweeps (-m); this run flies here" in here.stderr
     runs.record_run(tmp_path / "foreign.mcap", steps=3)
     for words, said in (
         (["calibrate", "nowhere"], "nowhere: cannot be read"),

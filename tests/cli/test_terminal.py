@@ -386,6 +386,10 @@ def test_settings_and_classes_of_the_users_own_folder_are_found(sweep, tmp_path)
     command = result["provenance"]["command"]
     assert command.startswith(f"gpmpc run {options} controller=mine ")
     assert command.endswith(" folder=tree")
+    if not sweep:
+        told = forked("run", *own_files, "--help", cwd=tmp_path).stdout
+        assert "seed: 5" in told
+        assert "controller: compiled, convex" in told
     for plan in (tmp_path / "tree").glob("sweep-*.json"):
         assert json.loads(plan.read_text())["search_options"] == options
 

@@ -4,12 +4,23 @@ import contextlib
 import json
 import sys
 import types
+from dataclasses import replace
 from importlib.util import find_spec
 
 import pytest
+from rich.console import Console
 
+from gpmpc.cli import _mlflow, _run
+from gpmpc.cli._experiment import experiment_of, experiment_of_file
 from gpmpc.cli._mlflow import log_to_mlflow
+from gpmpc.cli._plain_settings import plain_data
+from gpmpc.cli._run import run_one
+from gpmpc.cli._settings import compose, settings_folders
+from gpmpc.cli._sweep import Sweep
+from gpmpc.exceptions import SettingError
+from gpmpc.studies._run_folder import RunFolder
 from tests.cli.command import forked
+from tests.cli.test_one_run import to_fly
 
 TINY = ["steps=3", "data.samples=25", "model.restarts=0", "tracker=mlflow"]
 RESULT = {
@@ -54,6 +65,42 @@ def test_settings_metrics_and_files_reach_the_tracker(monkeypatch, tmp_path):
     assert store.seen["metrics"] == {"rmse.total": 0.5, "rmse.n": 2.0}
     assert (store.seen["experiment"], store.seen["name"]) == ("gpmpc", tmp_path.name)
     assert store.seen["artifacts"] == str(tmp_path)
+
+
+def test_a_result_reaches_the_tracker_once_however_late(monkeypatch, tmp_path):
+    """A run that was flown without it, or that it did not take, is taken later."""
+    monkeypatch.setitem(sys.modules, "mlflow", store := Store())
+    monkeypatch.setattr(_run, "_fly_and_measure", lambda *_: {"times": {"run": 1.0}})
+    seed = ["seed=3"]
+    run_one(to_fly(tmp_path, *seed, "folder=out"))
+    assert not store.seen
+    monkeypatch.setattr(store, "log_params", lambda params: 1 / 0)
+    assert run_one(to_fly(tmp_path, *seed, "tracker=mlflow")).skipped
+    monkeypatch.undo()
+    monkeypatch.setitem(sys.modules, "mlflow", store)
+    for seen in ("run", None):
+        store.seen.clear()
+        assert run_one(to_fly(tmp_path, *seed, "tracker=mlflow")).skipped
+        assert store.seen.get("name") == seen
+    # so does one of a sweep, whose folder may ask Hydra for a name
+    (tmp_path / "run/.mlflow").unlink()
+    with settings_folders():
+        words = ["tracker=mlflow", f"folder={tmp_path}/${{hydra:job.name}}"]
+        sweep = Sweep("run", words, Console())
+        assert sweep.tree == tmp_path / "run"
+        job = replace(sweep.job([*words, *seed]), folder=RunFolder(sweep.tree))
+        assert sweep.fly([job]) == []
+    assert store.seen["name"] == "run"
+
+
+def test_what_is_not_flown_needs_no_tracker(monkeypatch):
+    """A recording of a tracked flight is exported where there is none."""
+    monkeypatch.setattr(_mlflow, "find_spec", lambda name: None)
+    with settings_folders():
+        config = compose("run", ["tracker=mlflow"])
+    with pytest.raises(SettingError, match="tracker: needs MLflow"):
+        experiment_of(config)
+    assert experiment_of_file(plain_data(config), ()).seed == 0
 
 
 def test_an_unknown_or_absent_tracker_is_named_before_a_flight(tmp_path):

@@ -124,6 +124,15 @@ def test_groups_without_two_seeds_in_common_are_refused(tmp_path):
     assert compare(read_report(tmp_path), *GROUPS)[0].pairs == 2
 
 
+def test_a_value_that_holds_commas_is_named_as_it_stands(tmp_path):
+    for seed in range(2):
+        for R in ("[1,1]", "[2,2]"):
+            fly(tmp_path, "lqr", seed, 0.1, R=R)
+            fly(tmp_path, "convex", seed, 0.1, R=R)
+    groups = ("R=[1,1],controller=lqr", "controller=lqr,R=[2,2]")
+    assert compare(read_report(tmp_path), *groups)[0].pairs == 2
+
+
 def test_the_text_names_gaps_of_one_measure_and_gaps_of_all(tmp_path):
     for seed in range(8):
         fly(tmp_path, "lqr", seed, 0.1)
