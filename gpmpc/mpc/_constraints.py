@@ -286,11 +286,8 @@ def _tighten(F, kappa, covariances, lower, upper):
 
 
 @compiled
-def price_violations(prices, rows, plan, hard_price):
-    """Returns what violations along a plan cost.
-
-    Rows without a declared price cost ``hard_price`` per unit.
-    """
+def price_violations(prices, rows, plan):
+    """Returns what violations along a plan cost at finite prices of the rows (r,)."""
     E, D, lower, upper = rows
     total = 0.0
     for k in range(len(lower)):
@@ -302,7 +299,7 @@ def price_violations(prices, rows, plan, hard_price):
                 dot(D[k, e], u, len(u)) if len(D) > 0 else 0.0
             )
             outside = max(0.0, value - upper[k, e], lower[k, e] - value)
-            total += (hard_price if prices[e] == np.inf else prices[e]) * outside
+            total += prices[e] * outside
     return total
 
 

@@ -7,6 +7,9 @@ taken, a step is as long as it lowers the exact penalty
     cost + price of violated rows + sum_k mu' |F(s_k, u_k) - s_{k+1}|
 
 with mu above the multipliers of the dynamics (Nocedal and Wright, 2006, section 18.3).
+The price of a row is twice its largest multiplier, and at most its own: under an exact
+price of 1e6 weights a step along a curved row would be refused for what it misses in
+second order (the Maratos effect; section 15.5 there).
 Beside each length stands a second candidate: the dynamics rolled out under the feedback
 u = u' - K (x - x') towards the plan that the program proposes. It has no defects, and
 exists where inputs alone would lead an unstable plant away.
@@ -81,8 +84,7 @@ class MeritTerms(NamedTuple):
     """References and prices, which a cost needs besides its weights."""
 
     references: References
-    prices: Array  # of violated rows (r,), infinite for hard ones
-    hard_price: float  # what a hard row counts in the merit instead
+    prices: Array  # of violated rows (r,), finite
 
 
 class StepForecast(NamedTuple):
@@ -225,7 +227,9 @@ class Globalization:
         self._request = request
         self._tolerance = tolerance
         self._cost_floor = smallest_cost(prediction, request)
-        self._merit_terms = MeritTerms(request.references, row_prices, 0.0)
+        self._highest_prices = row_prices
+        no_prices = np.zeros(len(row_prices))
+        self._merit_terms = MeritTerms(request.references, no_prices)
         weight = prediction.costs.quadratic.terminal
         blocks, n, _ = weight.shape
         self._defect_prices = np.zeros(blocks * n)
@@ -256,7 +260,7 @@ class Globalization:
         """
         self._curvature.remember(program, solution, local)
         multipliers = _multipliers_by_stage(solution, local)
-        self._raise_hard_price(multipliers)
+        self._raise_row_prices(multipliers)
         forecast = _forecast_step.unchecked(
             local, self._merit_terms, self._defect_prices, proposed, multipliers
         )
@@ -275,13 +279,12 @@ class Globalization:
             return Iterate(trial, status=None)
         return self._end_without_step(local, proposed, is_optimum)
 
-    def _raise_hard_price(self, multipliers: Array) -> None:
-        """Raises the price of hard rows above their own multipliers, of (H, r) all."""
-        hard = np.isinf(self._merit_terms.prices)
-        if hard.any():
-            largest = float(np.abs(multipliers[:, hard]).max())
-            hard_price = max(self._merit_terms.hard_price, 2.0 * largest)
-            self._merit_terms = self._merit_terms._replace(hard_price=hard_price)
+    def _raise_row_prices(self, multipliers: Array) -> None:
+        """Raises what rows cost in the merit above their multipliers (H, r)."""
+        sufficient = 2.0 * np.abs(multipliers).max(axis=0)
+        raised = np.maximum(self._merit_terms.prices, sufficient)
+        prices = np.minimum(raised, self._highest_prices)
+        self._merit_terms = self._merit_terms._replace(prices=prices)
 
     def _search_line(
         self,
@@ -503,7 +506,7 @@ def _cost_of_step(cost, references, plan, proposed):
 def _priced_cost(cost, terms, rows, plan):
     """Returns the cost of a plan, with the price of its violated rows."""
     total = evaluate_cost(cost, plan.states, plan.inputs, terms.references, 1.0)
-    return total + price_violations(terms.prices, rows, plan, terms.hard_price)
+    return total + price_violations(terms.prices, rows, plan)
 
 
 @compiled

@@ -111,6 +111,21 @@ def test_a_spent_budget_ends_whole_steps_too():
     assert decision.status is Status.TIME_LIMIT
 
 
+@pytest.mark.parametrize("price", ["elastic", "exact", 30.0])
+def test_a_curved_bound_that_is_kept_takes_as_many_programs_at_any_price(price):
+    """A step along it misses it in second order, which is not to be refused."""
+    belief = Gaussian.certain(np.array([0.9, 0.0]))
+    reference = Reference(np.array([1.3, 0.4]))
+    programs = []
+    for penalty in (None, price):
+        steering = controller(Inequality(inside, penalty=penalty), iterations=30)
+        first = steering.control(belief, reference, None, CENTRE)
+        second = steering.control(belief, reference, first, CENTRE)
+        assert second.status is Status.SOLVED
+        programs.append(second.iterations)
+    assert programs[0] == programs[1]
+
+
 def test_a_moving_disc_is_passed_where_it_will_be():
     goal = np.array([1.3, 0.0])
 
