@@ -188,6 +188,14 @@ class Samples(NamedTuple):
         steps = np.diff(self.time[self.present])
         return float(np.median(steps)) if len(steps) else 0.0
 
+    @property
+    def resolution(self) -> float:
+        """The time [s] by which a sample may be later than a row that has it."""
+        usual_step = self.usual_step
+        if not usual_step:
+            return STAMP_RESOLUTION
+        return min(STAMP_RESOLUTION, FINE_RESOLUTION * usual_step)
+
     def column(self, index: int) -> "Samples":
         """Returns the samples of one column."""
         return Samples(self.time, self.values[:, index : index + 1])
@@ -212,9 +220,7 @@ def resample(samples: Samples, grid: Array, interpolation: Interpolation) -> Arr
     values = samples.values[present]
     if not len(time):
         return np.full((len(grid), values.shape[1]), np.nan)
-    resolution = STAMP_RESOLUTION
-    if len(time) > 1:
-        resolution = min(resolution, FINE_RESOLUTION * samples.usual_step)
+    resolution = samples.resolution
     sample = np.searchsorted(time, grid + resolution, side="right") - 1
     before = np.clip(sample, 0, None)
     after = np.clip(sample + 1, None, len(time) - 1)

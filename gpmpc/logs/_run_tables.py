@@ -16,6 +16,7 @@ from gpmpc.logs._clocks import (
     find_jumps,
     ordered_stamps,
 )
+from gpmpc.logs._decimation import changes_between_rows, held_means
 from gpmpc.logs._equal_stamps import TimedRows, merge_rows
 from gpmpc.logs._file import STAMP, Tables, names_of_list
 from gpmpc.logs._findings import RunFindings
@@ -87,7 +88,7 @@ def tabulate(
         is_kept = _kept_rows(topic, mapping)
         values = read_signal(topic.where, topic.table, signal, findings, is_kept)
         samples = Samples(topic.stamps.time, values)
-        columns.append(_signal_on_grid(samples, grid, signal, mapping))
+        columns.append(_signal_on_grid(samples, grid, signal, mapping, findings))
         _note_own_rate(samples, grid, signal, mapping, findings)
     return RunTable(
         name=findings.run,
@@ -275,7 +276,11 @@ def _make_grid(
 
 
 def _signal_on_grid(
-    samples: Samples, grid: Grid, signal: Signal, mapping: LogMapping
+    samples: Samples,
+    grid: Grid,
+    signal: Signal,
+    mapping: LogMapping,
+    findings: RunFindings,
 ) -> Array:
     """Resamples a signal to the rows of a grid (G, c), if there is need."""
     if mapping.rate is None and not any(signal.delays):
@@ -289,12 +294,30 @@ def _signal_on_grid(
         angles=signal.kind == "angle",
     )
     # What was measured at a time has a stamp that is later by the delay.
-    if len(set(signal.delays)) == 1:
-        return resample(samples, grid.time + signal.delays[0], interpolation)
-    columns = [
-        resample(samples.column(i), grid.time + delay, interpolation)
-        for i, delay in enumerate(signal.delays)
-    ]
+    delays = signal.delays
+    parts = [samples.column(i) for i in range(len(delays))]
+    if len(set(delays)) == 1:
+        delays = delays[:1]
+        parts = [samples]
+    may_average = (signal.role, signal.kind, signal.resample) == (
+        "inputs",
+        "vector",
+        "",
+    )
+    step = 1 / mapping.rate if mapping.rate else 0.0
+    columns = []
+    for part, delay in zip(parts, delays, strict=True):
+        times = grid.time + delay
+        values = resample(part, times, interpolation)
+        if may_average and changes_between_rows(part, Samples(times, values), step):
+            values = held_means(part, times, step, interpolation.max_gap)
+            text = (
+                f"{signal.name} changes between rows, {step / part.usual_step:.3g} "
+                "samples to each: a row has the mean over its step (resample: hold "
+                "takes the last sample)"
+            )
+            findings.add("averaged input", len(times), text)
+        columns.append(values)
     return np.concatenate(columns, axis=1)
 
 

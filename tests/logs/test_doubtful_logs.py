@@ -265,3 +265,46 @@ def test_streams_with_rows_of_their_own_need_a_rate(tmp_path):
         read_log(path, mapping)
     with pytest.raises(DataError, match="u in 0; state a longer max_gap"):
         read_log(path, {**mapping, "rate": 10})
+
+
+def fast_table(held_for):
+    """Returns 10 s at 1 kHz of a system of gain 5 whose input switches at random."""
+    switches = np.random.default_rng(0).choice([-1.0, 1.0], 10_000 // held_for)
+    inputs = np.repeat(switches, held_for)
+    states = np.zeros(10_000)
+    for k, u in enumerate(inputs[:-1]):
+        states[k + 1] = states[k] + 0.001 * (5 * u - 2 * states[k])
+    return pandas.DataFrame({"t": 0.001 * np.arange(10_000), "x": states, "u": inputs})
+
+
+def test_an_input_that_changes_between_rows_is_averaged(tmp_path):
+    table = fast_table(held_for=1).drop(index=range(4000, 4500))
+    path = written(tmp_path, table)
+    log = read_log(path, {**MAPPING, "rate": 50})
+    (text,) = texts(log, "averaged input")
+    assert text.startswith("u changes between rows, 20 samples to each: a row has the")
+    pairs = log.windows(1)
+    features = np.hstack([pairs.states[:, 0], pairs.inputs[:, 0]])
+    rates = 50 * (pairs.states[:, 1] - pairs.states[:, 0])
+    gains = np.linalg.lstsq(features, rates, rcond=None)[0].ravel()
+    np.testing.assert_allclose(gains, [-2, 5], rtol=0.05)
+    (run,) = log
+    assert np.diff(run.time).max() > 0.49  # nothing acts through the gap
+    for begin, end in run.pieces:
+        for row in range(begin, end - 1, 40):
+            acting = table["t"].between(run.time[row] - 1e-6, run.time[row] + 0.0195)
+            assert run.inputs[row, 0] == pytest.approx(table["u"][acting].mean())
+    held = {"u": {"columns": ["u"], "resample": "hold"}}
+    last = read_log(path, {**MAPPING, "rate": 50, "inputs": held})
+    assert set(np.unique(last.runs[0].inputs)) == {-1.0, 1.0}
+    assert not texts(last, "averaged input")
+
+
+def test_an_input_that_is_held_from_row_to_row_is_taken_as_it_is(tmp_path):
+    table = fast_table(held_for=20)
+    log = read_log(written(tmp_path, table), {**MAPPING, "rate": 50})
+    np.testing.assert_array_equal(log.runs[0].inputs[:, 0], table["u"][::20])
+    table["u"] = np.sin(3 * table["t"])
+    log = read_log(written(tmp_path, table), {**MAPPING, "rate": 50})
+    np.testing.assert_array_equal(log.runs[0].inputs[:, 0], table["u"][::20])
+    assert not log.findings
