@@ -277,6 +277,8 @@ class _Recordings:
         self._command = to_fly.command
         self._origin = _origin(plain_settings(to_fly.config, to_fly.options))
         self._live = to_fly.config.live
+        # Names that no recording takes are refused before anything is learned.
+        self._system = RecordedSystem.of(experiment.system)
         episodes = getattr(experiment.learning, "episodes", 0)
         names = [f"episode_{k}.mcap" for k in range(1, 1 + episodes)]
         self._paths = iter([to_fly.folder.path / name for name in (*names, RECORDING)])
@@ -295,7 +297,7 @@ class _Recordings:
         gp_size = self._gp_size(training)
         with McapRecorder(
             next(self._paths),
-            RecordedSystem.of(system, [side[0] for side in bounds]),
+            replace(self._system, input_bounds=[side[0] for side in bounds]),
             metadata=self._metadata(training),
             config=self._yaml_text,
             live=self._live,

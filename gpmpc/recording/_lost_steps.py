@@ -1,4 +1,15 @@
-"""Finds which steps of a recording are lost, repeated or in another order."""
+"""Finds which steps of a recording are lost, repeated or in another order.
+
+How many there were is counted by three: the index that closes a file, the metadata
+``end`` of the recorder, and the sequence numbers of the messages. Which is believed:
+
+    a damaged file with an index   the index, which has a checksum of its own
+    a whole file                   the larger of index and end: what rewrites a file
+                                   makes a new index, and keeps the end
+    one that was recovered         the numbering, where it is larger still: index and
+                                   end may be of what was left
+    without index and end          the numbering, of the steps up to the last one read
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -13,7 +24,7 @@ from gpmpc.recording._flaws import (
     WRONG_ORDER,
     Flaw,
 )
-from gpmpc.recording._schema import STEP
+from gpmpc.recording._schema import RECOVERY_METADATA, STEP
 
 _MOST_SPANS = 3  # of lost steps that are named
 
@@ -70,21 +81,17 @@ def _count_flaws(content: FileContent, present: int, where: str) -> list[Flaw]:
 def _recorded_steps(
     content: FileContent, by_index: int | None, by_end: int | None
 ) -> _Count:
-    """Chooses between the counts of index, end and numbering.
-
-    A damaged file: the index. A whole one: the larger of index and end. Without both:
-    the largest sequence number.
-    """
+    """Chooses between the counts of index, end and numbering: see the module's text."""
     is_damaged = any(flaw.kind in DAMAGE_KINDS for flaw in content.flaws)
-    if is_damaged and by_index is not None:  # which has a checksum of its own
-        return _Count(by_index, str(by_index))
-    # What rewrites a file makes a new index, and keeps the end.
+    if is_damaged and by_index is not None:
+        by_end = None
     counts = [count for count in (by_index, by_end) if count is not None]
-    if counts:
+    was_recovered = RECOVERY_METADATA in content.metadata
+    numbered = _numbered_steps(content)
+    if counts and not (was_recovered and numbered > max(counts)):
         return _Count(max(counts), str(max(counts)))
     # Those behind the last that was read are not known.
-    number = _numbered_steps(content)
-    return _Count(number, f"at least {number}")
+    return _Count(numbered, f"at least {numbered}")
 
 
 def _steps_by_end(content: FileContent) -> int | None:

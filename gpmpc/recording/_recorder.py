@@ -25,7 +25,7 @@ from gpmpc._calls import explains_arguments
 from gpmpc._files import as_path
 from gpmpc._interrupts import interrupts_after
 from gpmpc._provenance import flattened, provenance
-from gpmpc.exceptions import RecordingError, check_kind, check_number
+from gpmpc.exceptions import RecordingError, SettingError, check_kind, check_number
 from gpmpc.recording._encoding import Encoder, StepCopy
 from gpmpc.recording._frames import LARGEST, topics_of_chunk
 from gpmpc.recording._scene import WORLD, Scene
@@ -45,12 +45,13 @@ _LONGEST_WAIT = 1.0  # [s] of the clock after which the next step ends a chunk
 _SPAN = 2.0  # [s] of the flight in a chunk; a simulated one takes less than it lasts
 # [bytes] of numbers; fewer wait for more steps: a chunk has entries of its own
 _SMALLEST_CHUNK = 8 * 1024
+_TIME_LIMIT = 2**32  # [s], which dates count in 32 bits
 _PORT = 8765  # of the live view, if it is free
 
 
 @explains_arguments
 class McapRecorder:
-    """Writes the steps of one run to an MCAP file; a context manager.
+    """Writes the steps of one flight to an MCAP file; a context manager.
 
     Args:
         path: The file, such as ``run.mcap``; its folder is made, an older file is
@@ -103,22 +104,27 @@ class McapRecorder:
         self._unsaved_bytes = 0  # of numbers, in the chunk under way
         self._steps = 0
         self._chunk_begins_at = -math.inf  # [s] of the flight
+        self._last_k = -1  # number of the step before
         self._topics: dict[int, str] = {}  # by channel, as far as they are written
         self._level = "healthy"  # of the last judgement
         self._error: str | None = None  # why no more steps are taken
         self._saved_at_clock = 0.0  # [s]
         self._closed = False
         self._server: Any = None
-        self._sink = Sink(self.path)
         self._context = foxglove.Context()  # its channels live as long as it does
-        self._writer = _open_writer(self._sink, self._context)
-        self._write_description(described, config)
-        self._channels = self._encoder.channels(self._context)
-        self._log = LogChannel("/log", context=self._context)
-        self._scene = Scene(self._context, system)
-        if live:
-            self._server = _start_server(self.path.name, self._context)
-            self.address = f"ws://127.0.0.1:{self._server.port}"
+        self._sink = Sink(self.path)
+        try:
+            self._writer = _open_writer(self._sink, self._context)
+            self._write_description(described, config)
+            self._channels = self._encoder.channels(self._context)
+            self._log = LogChannel("/log", context=self._context)
+            self._scene = Scene(self._context, system)
+            if live:
+                self._server = _start_server(self.path.name, self._context)
+                self.address = f"ws://127.0.0.1:{self._server.port}"
+        except BaseException:
+            self._sink.close()  # another try may write the file
+            raise
 
     def _write_description(
         self,
@@ -145,11 +151,18 @@ class McapRecorder:
 
         Raises:
             ShapeError: An array does not fit the names of states and inputs.
+            SettingError: Its time is no number of seconds that a file can hold, or its
+                number is not larger than that of the step before: a recorder takes one
+                flight.
             RecordingError: An earlier step could not be written, the recorder is
                 closed, or a step is too large.
         """
         if self._error is not None:
             raise RecordingError(self._error)
+        _check_time(step.time)
+        if step.k <= self._last_k:
+            rule = f"must be above {self._last_k}: one recorder takes one flight"
+            raise SettingError("step.k", f"{rule}; got {step.k}")
         copy = StepCopy(step, self._n, self._m, self._record_problems)
         size = len(copy.data)
         if 4 * size > LARGEST:
@@ -159,6 +172,7 @@ class McapRecorder:
             )
         if self._unsaved_bytes == 0:
             self._chunk_begins_at = step.time
+        self._last_k = step.k
         self._waiting.append(copy)
         self._unsaved_bytes += size
         if self._server is not None:
@@ -276,6 +290,13 @@ class McapRecorder:
         if self._server is not None:
             self._server.stop()
         self._sink.close()
+
+
+def _check_time(time: float) -> None:
+    """Raises ``SettingError`` for a time [s] that a message cannot be dated with."""
+    check_number("step.time", time, least=0, unit="[s]")
+    if time >= _TIME_LIMIT:
+        raise SettingError("step.time", f"must be below {_TIME_LIMIT} [s]; got {time}")
 
 
 def _describe(

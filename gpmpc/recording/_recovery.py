@@ -11,7 +11,7 @@ from mcap.writer import CompressionType, Writer
 from gpmpc._calls import explains_arguments
 from gpmpc._files import whole_file
 from gpmpc.exceptions import RecordingError
-from gpmpc.recording._flaws import Flaw
+from gpmpc.recording._flaws import RECOVERED, Flaw
 from gpmpc.recording._read_run import read_run
 from gpmpc.recording._records import whole_records
 from gpmpc.recording._run import Run
@@ -71,6 +71,7 @@ class _Copy:
         self._messages = 0
         self._lists_topics = False
         self._was_recovered = False
+        self._earlier_reasons = ""  # what was wrong with the file before this one
 
     def add(self, record: McapRecord) -> None:
         """Copies a record."""
@@ -89,9 +90,11 @@ class _Copy:
             self._messages += 1
         elif isinstance(record, Metadata) and record.name == CHANNELS_METADATA:
             self._lists_topics = True
+        elif isinstance(record, Metadata) and record.name == RECOVERY_METADATA:
+            self._was_recovered = True
+            self._earlier_reasons = record.metadata.get("flaws", "")
         elif isinstance(record, Metadata):
             self._writer.add_metadata(record.name, record.metadata)
-            self._was_recovered |= record.name == RECOVERY_METADATA
         elif isinstance(record, Attachment):
             self._writer.add_attachment(
                 create_time=record.create_time,
@@ -120,11 +123,18 @@ class _Copy:
         self._topics[str(number)] = channel.topic
 
     def finish(self, flaws: Sequence[Flaw]) -> None:
-        """Writes the topics, the flaws of the file that was copied, and the index."""
+        """Writes the topics, the flaws of the file that was copied, and the index.
+
+        What was wrong with files that it was recovered from in turn is said first.
+        """
         if self._lists_topics:
             self._writer.add_metadata(CHANNELS_METADATA, self._topics)
-        if flaws and not self._was_recovered:
-            reasons = "; ".join(flaw.text for flaw in flaws)
-            about = {"messages": str(self._messages), "flaws": reasons}
+        earlier = self._earlier_reasons
+        reasons = [earlier] if earlier else []
+        for flaw in flaws:
+            if flaw.kind != RECOVERED and flaw.text not in earlier:
+                reasons.append(flaw.text)
+        if reasons or self._was_recovered:
+            about = {"messages": str(self._messages), "flaws": "; ".join(reasons)}
             self._writer.add_metadata(RECOVERY_METADATA, about)
         self._writer.finish()

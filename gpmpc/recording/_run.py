@@ -50,7 +50,7 @@ class Run:
     # (K, n) measured minus predicted one step ago; NaN where nothing was predicted, at
     # the first step or after one that failed, and where nothing was measured
     innovations: Array
-    belief_covariances: Array  # (K, n, n)
+    belief_covariances: Array  # (K, n, n) of a model loop; zero with a plant
     plan_inputs: Array  # (K, H, m)
     plan_means: Array  # (K, H + 1, n)
     plan_covariances: Array  # (K, H + 1, n, n)

@@ -24,6 +24,7 @@ class Sink:
     def __init__(self, path: Path):
         self._data = bytearray()
         self._position = 0
+        self._is_closed = False
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self.descriptor = os.open(
@@ -39,8 +40,10 @@ class Sink:
         os.ftruncate(self.descriptor, 0)
 
     def close(self) -> None:
-        """Closes the file; other processes may write it from now on."""
-        os.close(self.descriptor)
+        """Closes the file, once; other processes may write it from now on."""
+        if not self._is_closed:
+            self._is_closed = True
+            os.close(self.descriptor)
 
     @property
     def unsaved(self) -> bytes:

@@ -20,7 +20,7 @@ from gpmpc.recording import read_run
 from gpmpc.step import Step
 from gpmpc.studies import _run_folder
 from gpmpc.studies._run_folder import RunFolder, RunState
-from gpmpc.systems import translational
+from gpmpc.systems import System, translational
 
 
 def to_fly(tree, *overrides):
@@ -150,3 +150,23 @@ def test_a_recording_tells_how_many_points_a_saved_model_has(tmp_path):
         on_step(step)
     recorded = read_run(tmp_path / "run" / "run.mcap")
     assert recorded.gp_sizes.tolist() == [7]
+
+
+def test_names_that_no_recording_takes_are_refused_before_a_training(
+    tmp_path, monkeypatch
+):
+    class Leg:
+        state_names = ("left/hip",)
+        input_names = ("torque",)
+
+        def derivative(self, x, u):
+            return [u[0] - x[0]]
+
+    def trained(*_):
+        raise AssertionError("it was trained")
+
+    experiment = SimpleNamespace(system=System(Leg(), 0.1), learning=None)
+    monkeypatch.setattr(_run, "experiment_of", lambda config: experiment)
+    monkeypatch.setattr(_run, "run_trial", trained)
+    with pytest.raises(SettingError, match="a letter first; got 'left/hip'"):
+        _run._fly_and_measure(to_fly(tmp_path, "recorder=mcap"), "", None)

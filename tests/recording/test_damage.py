@@ -213,11 +213,16 @@ def test_a_plan_whose_step_is_lost_is_left_out(recorded, tmp_path):
 
 def test_numbers_that_come_again_keep_their_own_plans(tmp_path):
     path = tmp_path / "run.mcap"
-    rng = np.random.default_rng(0)
-    steps = [runs.make_step(k, rng) for k in (0, 1, 2, 0, 1)]  # two flights in one file
-    with runs.recorder(path) as recorder:
-        for step in steps:
-            recorder.record(step)
+    other = tmp_path / "other.mcap"
+    steps = runs.record_run(path, steps=3) + runs.record_run(other, steps=2)
+    flights = []
+
+    def join(messages):
+        flights.append(messages)
+        return [message for flight in flights for message in flight]
+
+    with_messages(path.read_bytes(), join)
+    path.write_bytes(with_messages(other.read_bytes(), join))  # two flights in one file
     np.testing.assert_array_equal(
         read_run(path).plan_means, [step.decision.means for step in steps]
     )

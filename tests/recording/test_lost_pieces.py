@@ -6,16 +6,19 @@ import time
 import zlib
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 import zstandard
+from mcap.writer import Writer
 
 from gpmpc.exceptions import RecordingError
 from gpmpc.recording import (
     McapRecorder,
     RecordedSystem,
     _recorder,
+    _recovery,
     read_run,
     recover,
 )
@@ -268,6 +271,23 @@ def test_what_is_recovered_says_what_it_lost(small, tmp_path):
     assert "1 of 4 chunks cannot be read" in run.flaws[-1].text
     again = recover(output, tmp_path / "again.mcap")
     assert again.metadata == run.metadata
+
+
+def test_what_is_recovered_twice_says_both_losses(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(_recovery, "Writer", partial(Writer, chunk_size=20_000))
+    data, steps = small
+    killed, first, second = (tmp_path / f"{name}.mcap" for name in "abc")
+    killed.write_bytes(data[: chunk_spans(data)[3][1] + 200])  # in its last chunk
+    recover(killed, first)
+    whole = first.read_bytes()
+    first.write_bytes(spoiled(whole, chunk_spans(whole)[0][1] + 200))
+    lost = read_run(first).lost_steps
+    run = recover(first, second)
+    assert is_right(run, steps)
+    assert 0 < lost == run.lost_steps == run.steps[-1] + 1 - len(run.steps)
+    reasons = run.metadata["recovered"]["flaws"]
+    assert "it has no end" in reasons
+    assert "chunks cannot be read" in reasons
 
 
 def test_data_are_whole_where_only_the_index_is_damaged(small, tmp_path):

@@ -346,6 +346,39 @@ def test_a_step_of_the_wrong_shape_is_refused(tmp_path, change, message):
 
 
 @pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"time": np.nan}, r"step.time: must be a number, 0 or more \[s\]; got nan"),
+        ({"time": -0.1}, "step.time: must be a number, 0 or more"),
+        ({"time": 5e9}, "step.time: must be below 4294967296"),
+        ({"k": 3}, "step.k: must be above 3: one recorder takes one flight; got 3"),
+    ],
+)
+def test_a_step_that_cannot_follow_is_refused_at_once(tmp_path, change, message):
+    path = tmp_path / "run.mcap"
+    steps = [runs.make_step(k, np.random.default_rng(k)) for k in (3, 4)]
+    with runs.recorder(path) as recorder:
+        recorder.record(steps[0])
+        with pytest.raises(SettingError, match=message):
+            recorder.record(replace(steps[1], **change))
+        recorder.record(steps[1])
+    assert read_run(path).steps.tolist() == [3, 4]
+
+
+def test_a_recorder_that_cannot_be_made_leaves_the_file_to_others(
+    tmp_path, monkeypatch
+):
+    def full(name, context):
+        raise RuntimeError("no port is left")
+
+    monkeypatch.setattr(_recorder, "_start_server", full)
+    with pytest.raises(RuntimeError, match="no port is left") as caught:
+        runs.recorder(tmp_path / "run.mcap", live=True)
+    assert caught.value.__traceback__ is not None  # which still holds the recorder
+    runs.recorder(tmp_path / "run.mcap").close()
+
+
+@pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
         ({"units": {"w": "m"}}, SettingError, "units: must be of x, vx"),
@@ -414,8 +447,8 @@ def test_a_full_disk_leaves_no_file_that_looks_finished(tmp_path, room):
 
     def record_too_much():
         with runs.recorder(path) as recorder, disk_of(room):
-            for step in 20 * steps:
-                recorder.record(step)
+            for k, step in enumerate(20 * steps):
+                recorder.record(replace(step, k=k))
 
     with pytest.raises(RecordingError) as caught:
         record_too_much()
