@@ -329,7 +329,8 @@ def _make_report(
     notes = [
         "In brackets under a mean error stands the root mean square. A width of 1 "
         "claims the spread that the errors have; the interval in brackets is the exact "
-        "one of Clopper and Pearson for windows that do not overlap.",
+        "one of Clopper and Pearson, for as many independent predictions as the "
+        "autocorrelation of the errors leaves.",
         f"Intervals hold {_NOISE_IN_WORDS}.",
         f"Candidates were compared on held-out rows: {learned.folds}.",
     ]

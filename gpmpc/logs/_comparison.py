@@ -92,6 +92,31 @@ def independent_predictions(windows: Windows, steps: Sequence[int]) -> Array:
     return rows / np.maximum(steps, windows.stride)
 
 
+def effective_number(values: Array, runs: np.ndarray) -> float:
+    """Computes how many independent values a mean of correlated ones is as good as.
+
+    That is N / (1 + 2 sum of autocorrelations), these summed in pairs of neighbouring
+    lags up to the first pair that is not positive (Geyer, 1992, Practical Markov chain
+    Monte Carlo: initial positive sequence).
+
+    Args:
+        values: N of them, in the order of time within each run (N,).
+        runs: Number of the run that each is of; runs tell nothing of each other (N,).
+    """
+    count = len(values)
+    deviations = values - values.mean()
+    autocovariances = np.zeros(count + count % 2)
+    for run in np.unique(runs):
+        own = deviations[runs == run]
+        spectrum = np.abs(np.fft.rfft(own, 2 * len(own))) ** 2
+        autocovariances[: len(own)] += np.fft.irfft(spectrum)[: len(own)]
+    if autocovariances[0] <= 0:
+        return float(count)
+    pairs = autocovariances.reshape(-1, 2).sum(axis=1) / autocovariances[0]
+    positive = np.logical_and.accumulate(pairs > 0)
+    return count / max(2 * pairs[positive].sum() - 1, 1.0)
+
+
 def _student(independent: Sequence[float] | Array) -> Array:
     """Returns by how much the logarithms of intervals (steps,) are to be longer.
 

@@ -24,6 +24,7 @@ from gpmpc.logs._comparison import (
     FEWEST_PREDICTIONS,
     Comparison,
     compare,
+    effective_number,
     independent_predictions,
 )
 from gpmpc.logs._fitting import PAST
@@ -42,6 +43,7 @@ MODEL = "model"  # name of the judged model among the predictors
 _WINDOWS = 1000
 _ROUNDING_SHARE = 1e-9  # of a constant state's error: an error by rounding
 _LINEARIZED = 100  # windows linearised at once
+_LARGEST_SIZE = 10.0  # of an error, in half widths of its interval, that counts
 _LEAST_SHORT_SHARE = 0.02  # of the rows in short pieces, that is told
 
 
@@ -62,7 +64,8 @@ class Judgement:
     mean: dict[str, Array]
     rmse: dict[str, Array]  #: root mean squared error, likewise
     coverage: Array  #: frequency of the entries inside their interval (k, groups)
-    #: exact interval of that frequency, from independent windows only (k, groups, 2)
+    #: exact interval of that frequency, of as many predictions as are independent by
+    #: the autocorrelation of their errors (k, groups, 2)
     coverage_interval: Array
     width: Array  #: claimed over actual root mean square (k, groups)
     windows: tuple[int, ...]  #: number of predictions by k
@@ -199,6 +202,7 @@ def _judge_windows(
     variances = _claimed_variances(learned, windows, steps)
     variances = follow_errors(windows, model_errors, variances, steps, longest)
     half_width = ndtri((1 + LEVEL) / 2) * np.sqrt(variances)
+    sizes = np.abs(model_errors) / np.maximum(half_width, 1e-300)
     coverage = _group_means(space, np.abs(model_errors) <= half_width)
     claimed = _group_means(space, variances)
     actual = _group_means(space, np.square(model_errors))
@@ -209,7 +213,7 @@ def _judge_windows(
         mean={name: d.mean(axis=0) for name, d in distances.items()},
         rmse={n: np.sqrt(np.square(d).mean(axis=0)) for n, d in distances.items()},
         coverage=coverage,
-        coverage_interval=_coverage_intervals(coverage, windows, steps),
+        coverage_interval=_coverage_intervals(coverage, sizes, windows, steps),
         width=np.sqrt(claimed / np.maximum(actual, 1e-300)),
         windows=(len(windows),) * len(steps),
         comparisons=_comparisons(distances, windows, steps, longest),
@@ -461,16 +465,27 @@ def _error_units(space: StateSpace) -> tuple[str, ...]:
 
 
 def _coverage_intervals(
-    coverage: Array, windows: Windows, steps: Sequence[int]
+    coverage: Array, sizes: Array, windows: Windows, steps: Sequence[int]
 ) -> Array:
     """Computes exact intervals of frequencies (steps, groups, 2).
 
-    Only predictions that do not overlap are counted: they are independent.
+    Predictions that overlap are not independent, nor are those whose errors are alike
+    for longer: as many are counted as the autocorrelation of the errors' sizes leaves.
+
+    Args:
+        coverage: The frequencies (steps, groups).
+        sizes: Of errors, over half the widths of their intervals (W, steps, e).
+        windows: W of them.
+        steps: After the starts.
     """
-    intervals = []
-    counts = np.maximum(independent_predictions(windows, steps).astype(int), 1)
-    for frequencies, count in zip(coverage, counts.tolist(), strict=True):
-        intervals.append(
-            [binomial_interval(round(f * count), count, LEVEL) for f in frequencies]
-        )
-    return np.array(intervals)
+    apart = independent_predictions(windows, steps)
+    bounded = np.minimum(np.nan_to_num(sizes, nan=np.inf), _LARGEST_SIZE)
+    intervals = np.empty((*coverage.shape, 2))
+    for g, columns in enumerate(windows.space.error_columns):
+        of_group = bounded[..., columns].mean(axis=-1)  # (W, steps)
+        for k in range(len(steps)):
+            effective = effective_number(of_group[:, k], windows.runs)
+            count = max(int(min(apart[k], effective)), 1)
+            covered = round(float(coverage[k, g]) * count)
+            intervals[k, g] = binomial_interval(covered, count, LEVEL)
+    return intervals

@@ -6,15 +6,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gp import train
 from gpmpc.logs import Judgement, Log, LogMapping, fit_nominal, judge, learn
 from gpmpc.logs._baselines import baseline_errors
-from gpmpc.logs._comparison import compare
+from gpmpc.logs._comparison import compare, effective_number
 from gpmpc.logs._control_fitness import _linearize, judge_for_control
 from gpmpc.logs._fitting import _standard_errors, fit_least_squares
 from gpmpc.logs._folds import split_folds
+from gpmpc.logs._judging import _coverage_intervals
 from gpmpc.logs._learning import _plan_folds
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._noise import _nonnegative_solution, learning_gains
@@ -513,6 +515,24 @@ def test_windows_that_overlap_are_one_error():
         _standard_errors(np.ones((160, 1)), residuals, block) for block in (1, 10)
     ]
     np.testing.assert_allclose(errors[1] / errors[0], np.sqrt(10), rtol=1e-3)
+
+
+def test_intervals_of_a_coverage_hold_where_errors_are_alike_for_long():
+    log = log_of(np.zeros((2, 500, 2)), np.zeros((2, 500, 1)))
+    windows = log.windows(1)
+    rng = np.random.default_rng(0)
+    rho = np.exp(-1 / 25)
+    held = []
+    for _ in range(60):
+        noise = np.sqrt(1 - rho**2) * rng.normal(size=(1000 + len(windows), 1, 2))
+        errors = lfilter([1], [1, -rho], noise, axis=0)[1000:]
+        sizes = np.abs(errors) / 1.96
+        coverage = np.mean(sizes <= 1, axis=0)
+        intervals = _coverage_intervals(coverage, sizes, windows, (1,))
+        held.append((intervals[..., 0] <= 0.95) & (intervals[..., 1] >= 0.95))
+    assert np.mean(held) >= 0.92
+    white = rng.normal(size=len(windows))
+    assert effective_number(white, windows.runs) > 0.8 * len(white)
 
 
 def test_noise_is_fitted_to_what_is_finite():
