@@ -5,6 +5,7 @@ certain, and left out where it is not; what stands on both sides of a jump are p
 their own.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,10 @@ MOST_FIT = 0.9  # of the rows out of order that have to fit, to be sorted
 MOST_DROPS = 0.2  # of the rows; beyond, neighbours in the file are none in time
 JUMP = 60.0  # [s] from which a step of time is a jump, if it is also
 JUMP_STEPS = 100  # usual time steps: over neither is anything resampled
-ORDER_ROWS = "name the column of the runs, or order the rows"
+RESTART_ROWS = 10  # that lie before what came, after a clock that began anew
+# of the time that a clock had gone; one that began anew shows less
+RESTART_SHARE = 0.1
+ORDER_ROWS = "name the column of the runs, or give each of them a file"
 ORDER_TOPICS = "write 'stamp: log' to take the times of logging"
 
 
@@ -32,20 +36,26 @@ class Stamps(NamedTuple):
     repeated: int
     backwards: int  # rows that are left out because a later stamp stood before
     disordered: int = 0  # rows that stood behind later ones, and are sorted
+    restarts: int = 0  # of the clock: what follows one has got later stamps
 
 
-def ordered_stamps(stamps: Array, where: str, hint: str = ORDER_ROWS) -> Stamps:
+def ordered_stamps(
+    stamps: Array, where: str, hint: str = ORDER_ROWS, may_restart: bool = False
+) -> Stamps:
     """Brings rows into the order of their stamps.
 
     Rows out of order are sorted if they fit between the others, as messages do that a
     file holds in another order, or parts on both sides of a clock that was set. Where
     sorting would mix rows, those whose stamp is not the latest are left out: a stamp is
-    wrong, or a clock was set back.
+    wrong, or a clock was set back. Where a clock began anew, what follows is a part of
+    its own, and gets stamps behind the others.
 
     Args:
         stamps: Of the rows in the order of the file (K,) [s].
         where: Names the table, for errors.
         hint: Says what to do where too many rows run backwards.
+        may_restart: Whether the clock may begin anew. Where other tables have times in
+            common with this one, nobody knows which.
 
     Raises:
         DataError: A stamp is not finite, or more than ``MOST_OUT_OF_ORDER`` of the rows
@@ -60,7 +70,20 @@ def ordered_stamps(stamps: Array, where: str, hint: str = ORDER_ROWS) -> Stamps:
     is_late = np.r_[False, stamps[1:] < latest[:-1]]
     if is_late.any() and _fit_between(stamps, is_late):
         return _sorted_rows(stamps, disordered=int(is_late.sum()))
-    return _rising_rows(stamps, latest, where, hint)
+    rising = _rising_rows(stamps)
+    if rising.backwards <= MOST_OUT_OF_ORDER * len(stamps):
+        return rising
+    parts = np.split(stamps, _restarts(stamps)) if may_restart else [stamps]
+    risings = [_rising_rows(part) for part in parts]
+    left_out = sum(part.backwards for part in risings)
+    if left_out > MOST_OUT_OF_ORDER * len(stamps):
+        row = int(np.argmax(is_late))
+        raise DataError(
+            f"{where}: time runs backwards in row {row + 1} (from {stamps[row - 1]:g} "
+            f"to {stamps[row]:g} s), and {rising.backwards} rows come before the "
+            f"latest stamp: {hint}"
+        )
+    return _in_turn(risings)
 
 
 def _sorted_rows(stamps: Array, disordered: int) -> Stamps:
@@ -77,21 +100,12 @@ def _sorted_rows(stamps: Array, disordered: int) -> Stamps:
     )
 
 
-def _rising_rows(stamps: Array, latest: Array, where: str, hint: str) -> Stamps:
-    """Takes the rows whose stamps (K,) [s] are later than all before.
-
-    ``latest`` (K,) holds the latest stamp up to each row.
-    """
+def _rising_rows(stamps: Array) -> Stamps:
+    """Takes the rows whose stamps (K,) [s] are later than all before."""
+    latest = np.maximum.accumulate(stamps)
     rises = np.r_[True, stamps[1:] > latest[:-1]]
     repeated = np.r_[False, stamps[1:] == stamps[:-1]] & ~rises
     backwards = ~rises & ~repeated
-    if backwards.sum() > MOST_OUT_OF_ORDER * len(stamps):
-        row = int(np.argmax(backwards))
-        raise DataError(
-            f"{where}: time runs backwards in row {row + 1} (from {stamps[row - 1]:g} "
-            f"to {stamps[row]:g} s), and {int(backwards.sum())} rows come before the "
-            f"latest stamp: {hint}"
-        )
     rows = np.flatnonzero(rises)
     reversed_before = np.diff(np.cumsum(backwards)[rows], prepend=0) > 0
     return Stamps(
@@ -100,6 +114,60 @@ def _rising_rows(stamps: Array, latest: Array, where: str, hint: str) -> Stamps:
         after_reversal=reversed_before,
         repeated=int(repeated.sum()),
         backwards=int(backwards.sum()),
+    )
+
+
+def _restarts(stamps: Array) -> np.ndarray:
+    """Finds the rows (R,) at which a clock began anew, as after a reboot.
+
+    It falls back to about where it had begun, and the rows that follow lie before those
+    that came: other than after a row that is late, or rows of two clocks in turn.
+    """
+    drops = np.flatnonzero(np.diff(stamps) < 0) + 1
+    if len(drops) > MOST_DROPS * len(stamps):
+        return np.empty(0, dtype=int)
+    restarts = []
+    first = stamps[0]  # of the part before
+    latest = first
+    for drop in drops:
+        latest = max(latest, stamps[drop - 1])
+        following = stamps[drop : drop + RESTART_ROWS]
+        begins_anew = stamps[drop] <= first + RESTART_SHARE * (latest - first)
+        if len(following) == RESTART_ROWS and following.max() < latest and begins_anew:
+            restarts.append(drop)
+            first = stamps[drop]
+            latest = first
+    return np.array(restarts, dtype=int)
+
+
+def _in_turn(parts: Sequence[Stamps]) -> Stamps:
+    """Puts the rows of parts behind each other, whose clocks have nothing in common.
+
+    How long it took from one to the next is unknown: longer than any gap.
+    """
+    rows = []
+    times = []
+    breaks = []
+    begin = 0
+    end = parts[0].time[0]
+    for part in parts:
+        pause = 0.0
+        if times:
+            steps = np.diff(part.time)
+            usual_step = float(np.median(steps)) if len(steps) else 0.0
+            pause = 2 * max(JUMP, JUMP_STEPS * usual_step)
+        rows.append(begin + part.rows)
+        times.append(part.time - part.time[0] + end + pause)
+        breaks.append(np.r_[bool(pause), part.after_reversal[1:]])
+        begin += len(part.rows) + part.repeated + part.backwards
+        end = times[-1][-1]
+    return Stamps(
+        rows=np.concatenate(rows),
+        time=np.concatenate(times),
+        after_reversal=np.concatenate(breaks),
+        repeated=sum(part.repeated for part in parts),
+        backwards=sum(part.backwards for part in parts),
+        restarts=len(parts) - 1,
     )
 
 

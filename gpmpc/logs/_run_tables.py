@@ -123,7 +123,7 @@ def _read_topic(
     columns = [column for signal in signals for column in signal.columns]
     rows = TimedRows(table, times)
     table, times = merge_rows(rows, [*columns, *mapping.keep], findings)
-    stamps = ordered_stamps(times, where, hint)
+    stamps = ordered_stamps(times, where, hint, may_restart=not topic)
     ordered = table.iloc[stamps.rows]
     measured = ordered
     if any((signal.held or mapping.held) != "use" for signal in signals):
@@ -237,7 +237,13 @@ def _note_stamps(
         ("rows out of order", stamps.disordered, "sorted by their stamps"),
     ):
         findings.add(kind, count, f"{count} rows{of_topic}: {remedy}")
+    text = (
+        f"the clock began anew {stamps.restarts} times: boundaries, the rows on both "
+        "sides are used, and their times go on behind a pause"
+    )
+    findings.add("clock began anew", stamps.restarts, text)
     jumps = find_jumps(stamps.time, mapping.max_gap)
+    jumps = jumps[~stamps.after_reversal[jumps + 1]]
     if len(jumps):
         longest = float(np.diff(stamps.time)[jumps].max())
         text = (

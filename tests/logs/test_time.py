@@ -144,15 +144,32 @@ def test_a_clock_that_was_set_back_is_named_with_a_way_out(tmp_path):
     assert len(read_log(path, {**BAG_MAPPING, "stamp": "log"})) == ROWS
 
 
-@pytest.mark.parametrize("offset", [0.1, 0.37, 0.5])
+@pytest.mark.parametrize("offset", [0.0, 0.1, 0.37, 0.5])
 @pytest.mark.parametrize("rows", [ROWS, ROWS * 3 // 4])
-def test_two_runs_at_one_time_are_never_mixed(tmp_path, offset, rows):
+@pytest.mark.parametrize("rate", [None, 50])
+def test_two_runs_at_one_time_are_never_mixed(tmp_path, offset, rows, rate):
     first = strange.pendulum(ROWS)
     second = strange.pendulum(rows)
     second["t"] += offset * STEP
-    pandas.concat([first, second]).to_csv(tmp_path / "arm.csv", index=False)
-    with pytest.raises(DataError, match="runs backwards in row 401 .*the runs"):
-        read_log(tmp_path / "arm.csv", TABLE_MAPPING)
+    both = pandas.concat([first, second])
+    both.to_csv(tmp_path / "arm.csv", index=False)
+    log = read_log(tmp_path / "arm.csv", {**TABLE_MAPPING, "rate": rate})
+    (run,) = log
+    assert run.begins == (0, ROWS)
+    np.testing.assert_allclose(run.states, both[["angle", "rate"]], atol=1e-9)
+    assert kinds(log) == {"clock began anew": 1}
+
+
+def test_rows_of_two_clocks_in_turn_are_refused(tmp_path):
+    first = strange.pendulum(ROWS)
+    second = first.assign(t=first["t"] + 0.3 * STEP)
+    for rows in (20, 100):
+        in_turn = [
+            part[k : k + rows] for k in range(0, ROWS, rows) for part in (first, second)
+        ]
+        pandas.concat(in_turn).to_csv(tmp_path / "arm.csv", index=False)
+        with pytest.raises(DataError, match="runs backwards in row .*the runs"):
+            read_log(tmp_path / "arm.csv", TABLE_MAPPING)
 
 
 @pytest.mark.parametrize("rate", [None, 50])
