@@ -31,7 +31,8 @@ class Status(Enum):
         "check the scaling of the problem"
     )
     INVALID_MEASUREMENT = (
-        "the state is not finite: check the estimator; the last plan can bridge a gap"
+        "the state is not finite: check the estimator; the last plan can bridge a gap "
+        "(or parameters of the controller are not finite)"
     )
     FUNCTION_NOT_FINITE = (
         "a constraint or output, or its gradient, is not finite along the plan: "

@@ -25,7 +25,7 @@ from gpmpc.export._text import Numbers
 from gpmpc.export._write import Precision, write_code
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import GPMPC, Decision, PredictionSettings, Problem, Reference, Timing
-from gpmpc.mpc._controller import read_reference
+from gpmpc.mpc._controller import read_parameters, read_reference
 from gpmpc.propagation import Propagator
 from gpmpc.qp import QPSolution, QPSolver
 from gpmpc.qp import _record as layout
@@ -247,6 +247,8 @@ class CompiledController:
         """Decides the input for one step; see ``GPMPC.control``."""
         belief = belief.in_order(self.signals.state_names)
         reference = reference.in_order(self.signals)
+        if parameters is not None:
+            parameters = read_parameters(parameters, self.horizon)
         followed = self._library.reference(reference, parameters)
         fields = self._struct.fields
         with self._is_deciding:
@@ -385,6 +387,7 @@ def _continue(fields: Any, previous: Decision) -> None:
         view(fields.disturbance)[:] = previous.disturbance
     fields.has_input = int(np.isfinite(previous.input).all())
     fields.has_plan = int(fits and previous.applicable)
+    fields.unmeasured_steps = previous.unmeasured_steps
     if fields.has_plan:
         view(fields.means)[:] = previous.means
         view(fields.inputs)[:] = previous.inputs

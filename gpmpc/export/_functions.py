@@ -10,7 +10,7 @@ from gpmpc.export._expressions import expansion_lines, graph_of_tape
 from gpmpc.export._text import Numbers, function, unused
 from gpmpc.models import CasadiFunction
 from gpmpc.mpc import GPMPC, Inequality
-from gpmpc.mpc._controller import read_parameters
+from gpmpc.mpc._controller import parameters_by_stage
 from gpmpc.mpc._cost import by_stage
 
 
@@ -163,7 +163,7 @@ def parameter_rows(parameters: Any, horizon: int, count: int) -> np.ndarray:
         raise SettingError("parameters", f"{rule}; got none")
     if parameters is None:
         return np.zeros((horizon, 0))
-    rows = read_parameters(parameters, horizon)
+    rows = parameters_by_stage(parameters, horizon)
     if rows.shape != (horizon, count):
         rule = f"the controller's functions take {count} parameters a stage"
         raise ShapeError(f"{rule}; got {rows.shape}")

@@ -319,16 +319,27 @@ static void guess_inputs(gpmpc_controller *controller)
         }
 }
 
-/* d <- (1 - L) d + L (x - f(x', u')): what the last step showed of a constant error */
+/* Whether the policy has moved the plan on to its last stage, or beyond: it then says
+   nothing of where the plant is. */
+static int is_used_up(const gpmpc_controller *controller)
+{
+    return controller->unmeasured_steps > 0 && controller->unmeasured_steps > H - 2;
+}
+
+/* d <- (1 - L) d + L (x - f(x', u')): what the last step showed of a constant error;
+   of steps without a measurement it is the mean */
 static void estimate_disturbance(gpmpc_controller *controller, const real *state)
 {
     real mean[GPMPC_STATES];
     real error[GPMPC_STATES];
+    real gain = GPMPC_DISTURBANCE_GAIN / (1 + (real)controller->unmeasured_steps);
     int i, a;
     if (!controller->has_plan) {
         fill(controller->disturbance, 0, n);
         return;
     }
+    if (is_used_up(controller))
+        return;
     model(controller->means[0], controller->problem.previous_input,
           &controller->problem.work, mean, 0, 0);
     for (i = 0; i < n; i++) {
@@ -340,8 +351,7 @@ static void estimate_disturbance(gpmpc_controller *controller, const real *state
     if (!all_finite(error, n)) /* the model has no numbers there */
         return;
     for (i = 0; i < n; i++)
-        controller->disturbance[i] +=
-            GPMPC_DISTURBANCE_GAIN * (error[i] - controller->disturbance[i]);
+        controller->disturbance[i] += gain * (error[i] - controller->disturbance[i]);
 }
 
 #if GPMPC_TUBES
@@ -383,17 +393,17 @@ static void write_offset(gpmpc_problem *problem, int k, int i, real after,
 }
 
 /* Whether a plan may lead from a state to ``after`` where the model leads to ``next``:
-   not where these are further apart than the data are wide, twice. */
+   not where these are further apart than the data are wide, twice, or no numbers. */
 static int is_motion(real next, real after, int i)
 {
+    real distance = absolute(next - after);
 #if GPMPC_KNOWS_RANGES
-    return !(absolute(next - after) > 2 * data_ranges[i]);
+    if (!(distance <= 2 * data_ranges[i]))
+        return 0;
 #else
-    (void)next;
-    (void)after;
     (void)i;
-    return 1;
 #endif
+    return is_finite(distance);
 }
 
 /* Linearises the dynamics along the plan: c = f(s, u) + d - A s - B u. Returns whether
@@ -418,6 +428,9 @@ static int linearize(gpmpc_controller *controller)
             if (!GPMPC_HELD)
                 moves = moves && is_motion(after, problem->states[k + 1][i], i);
         }
+        if (!GPMPC_HELD)
+            moves = moves && all_finite(&problem->A[k][0][0], n * n)
+                    && all_finite(&problem->B[k][0][0], n * m);
 #if GPMPC_TUBES
         if (work->lane == GPMPC_LANES - 1 || k == GPMPC_STAGES - 1)
             write_model_covariances(problem, k - work->lane, k + 1);
@@ -445,21 +458,53 @@ static void follow_inputs(gpmpc_controller *controller)
 }
 
 #if GPMPC_HELD
+/* Shares what the plan, moved by full turns (n), did not foresee out over the steps
+   without a measurement. */
+static void share_increments(gpmpc_controller *controller, const real *turns)
+{
+    gpmpc_problem *problem = &controller->problem;
+    const int planned = H > 1 ? 2 : 1; /* a plan of one stage is used up */
+    real before[GPMPC_STATES];
+    real c[GPMPC_STATES];
+    real share = 1 / (1 + (real)controller->unmeasured_steps);
+    int i;
+#if GPMPC_IS_FLOAT
+    real c_low[GPMPC_STATES];
+    copy(problem->c_low[0], c_low, n);
+#endif
+    copy(problem->c[0], c, n);
+    for (i = 0; i < n; i++)
+        before[i] = controller->means[1][i] + turns[i];
+    for (i = 0; i < n; i++) {
+        write_offset(problem, 0, i, controller->means[planned][i] + turns[i], before,
+                     controller->inputs[planned - 1]);
+        problem->c[0][i] += (c[i] - problem->c[0][i]) * share;
+#if GPMPC_IS_FLOAT
+        problem->c_low[0][i] += (c_low[i] - problem->c_low[0][i]) * share;
+#endif
+    }
+}
+
 /* The held linearisation as that of the increments since the last step:
    c = s_0 - A s_{-1} - B u_{-1}, in which a constant error of the model cancels. */
 static void write_increments(gpmpc_controller *controller)
 {
     gpmpc_problem *problem = &controller->problem;
     real last[GPMPC_STATES];
+    real turns[GPMPC_STATES];
     int i, a;
-    copy(controller->means[0], last, n);
+    fill(turns, 0, n);
     for (a = 0; a < GPMPC_STATE_ANGLE_COUNT; a++) {
         i = state_angles[a];
-        last[i] += whole_turns(problem->states[0][i] - last[i]);
+        turns[i] = whole_turns(problem->states[0][i] - controller->means[0][i]);
     }
+    for (i = 0; i < n; i++)
+        last[i] = controller->means[0][i] + turns[i];
     for (i = 0; i < n; i++)
         write_offset(problem, 0, i, problem->states[0][i], last,
                      problem->previous_input);
+    if (controller->unmeasured_steps > 0)
+        share_increments(controller, turns);
 }
 #endif
 
@@ -1675,7 +1720,7 @@ static int write_local_problem(gpmpc_controller *controller, const real *covaria
     (void)covariance;
 #endif
 #if GPMPC_HELD
-    if (controller->has_plan)
+    if (controller->has_plan && !is_used_up(controller))
         write_increments(controller);
 #endif
     return write_rows(problem, reference);
@@ -1818,6 +1863,9 @@ static int continue_last_plan(gpmpc_controller *controller)
     int k;
     if (!controller->has_plan)
         return 0;
+    controller->unmeasured_steps++;
+    if (GPMPC_HOLDS && controller->unmeasured_steps > 1)
+        controller->unmeasured_steps = H; /* what a held input leads to is not planned */
     for (k = 0; k < H; k++) {
         copy(controller->means[k + 1], controller->means[k], n);
         if (k < H - 1)
@@ -1853,6 +1901,7 @@ static int take_plan(gpmpc_controller *controller)
     copy(&problem->inputs[0][0], &controller->inputs[0][0], H * m);
     controller->solution = controller->candidate;
     controller->has_plan = 1;
+    controller->unmeasured_steps = 0;
     return 1;
 }
 
@@ -1861,6 +1910,7 @@ void gpmpc_reset(gpmpc_controller *controller)
     int i;
     controller->has_input = 0;
     controller->has_plan = 0;
+    controller->unmeasured_steps = 0;
     controller->failed = 0;
     controller->status = GPMPC_SOLVED;
     controller->violation = 0;
@@ -1887,6 +1937,17 @@ void gpmpc_hold(gpmpc_reference *reference, const gpmpc_real state[GPMPC_STATES]
     reference->has_inputs = 0;
 }
 
+/* Whether parameters, which are measured as the state is, are finite. */
+static int knows_parameters(const gpmpc_reference *reference)
+{
+#if GPMPC_PARAMETERS
+    return all_finite(&reference->parameters[0][0], H * GPMPC_PARAMETERS);
+#else
+    (void)reference;
+    return 1;
+#endif
+}
+
 int gpmpc_step_belief(gpmpc_controller *controller, const gpmpc_real mean[GPMPC_STATES],
                       const gpmpc_real covariance[GPMPC_STATES * GPMPC_STATES],
                       const gpmpc_reference *reference,
@@ -1896,7 +1957,8 @@ int gpmpc_step_belief(gpmpc_controller *controller, const gpmpc_real mean[GPMPC_
     int status = GPMPC_INVALID_MEASUREMENT;
     real disturbance[GPMPC_STATES];
     copy(controller->disturbance, disturbance, n);
-    if (all_measured(mean, n) && all_finite(covariance, n * n))
+    if (all_measured(mean, n) && all_finite(covariance, n * n)
+        && knows_parameters(reference))
         status = decide(controller, mean, covariance, reference, &applicable);
     if (applicable && !take_plan(controller)) {
         applicable = 0;

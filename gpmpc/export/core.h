@@ -22,7 +22,8 @@ enum gpmpc_status {
     GPMPC_ITERATION_LIMIT,      /* the quadratic program took too many changes */
     GPMPC_TIME_LIMIT,           /* never: a step knows no clock */
     GPMPC_NUMERICAL_TROUBLE,    /* the digits did not suffice, or were not finite */
-    GPMPC_INVALID_MEASUREMENT,  /* what was measured is not finite, or >= 1e30 */
+    /* what was measured, or a parameter, is not finite; or a measurement is >= 1e30 */
+    GPMPC_INVALID_MEASUREMENT,
     GPMPC_FUNCTION_NOT_FINITE,  /* a constraint or an output is not */
     GPMPC_SOFT_BOUND_MISSED,    /* solved, but a soft bound is missed */
     GPMPC_STALLED,              /* never: a step takes one program */
@@ -193,6 +194,7 @@ typedef struct {
     /* what the next step needs of the last one */
     int has_input; /* whether an input was applied */
     int has_plan;  /* whether there is a plan to go on along */
+    int unmeasured_steps; /* by which the policy has moved that plan on */
     gpmpc_real input[GPMPC_INPUTS]; /* the one that was applied */
     gpmpc_real means[GPMPC_HORIZON + 1][GPMPC_STATES];
     gpmpc_real inputs[GPMPC_HORIZON][GPMPC_INPUTS];

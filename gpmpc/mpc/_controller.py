@@ -41,6 +41,10 @@ KEPT = 1e-5  # by how much a bound may be missed that counts as kept, in its uni
 _FLOAT64 = np.dtype(np.float64)
 
 
+class ParametersNotFinite(DataError):
+    """Parameters of a decision that are not finite, such as of an obstacle unseen."""
+
+
 @explains_arguments
 @dataclass(frozen=True)
 class Reference:
@@ -242,6 +246,9 @@ class Decision:
     #: ``version``, how often it has changed; where it has ``later()``, that is what is
     #: handed on after a step at which the controller was not called
     learned: Any = None
+    #: steps since the last measurement: a policy has moved the plan on by so many, and
+    #: its first mean is predicted
+    unmeasured_steps: int = 0
 
     def __post_init__(self) -> None:
         # a copy, no view of the plan
@@ -255,6 +262,16 @@ class Decision:
         applied instead is the loop's policy (``gpmpc.mpc._policy``).
         """
         return self.status.solved or self.suboptimal
+
+    @property
+    def is_used_up(self) -> bool:
+        """Whether a policy has moved the plan on to its last stage, or beyond.
+
+        It then says nothing of where the plant is.
+        """
+        return self.unmeasured_steps > 0 and (
+            self.unmeasured_steps > len(self.inputs) - 2
+        )
 
     @cached_property
     def novelty(self) -> float:
@@ -626,7 +643,24 @@ def _as_array(value: Any, key: str = "a state, a reference or a plan") -> Array:
 
 
 def read_parameters(parameters: Any, horizon: int) -> Array:
-    """Returns finite parameters of every stage (H, q), given as these or as (q,)."""
+    """Returns finite parameters of every stage (H, q), given as these or as (q,).
+
+    Raises:
+        ShapeError: They are neither.
+        ParametersNotFinite: Some are not finite.
+    """
+    values = parameters_by_stage(parameters, horizon)
+    if not np.isfinite(values).all():
+        raise ParametersNotFinite("parameters must be finite")
+    return values
+
+
+def parameters_by_stage(parameters: Any, horizon: int) -> Array:
+    """Returns parameters of every stage (H, q), given as these or as (q,).
+
+    Raises:
+        ShapeError: They are neither.
+    """
     values = np.atleast_1d(_as_array(parameters, "parameters"))
     if values.ndim == 1:
         values = np.tile(values, (horizon, 1))
@@ -634,8 +668,6 @@ def read_parameters(parameters: Any, horizon: int) -> Array:
         raise ShapeError(
             f"parameters must be (q,) or ({horizon}, q); got {np.shape(parameters)}"
         )
-    if not np.isfinite(values).all():
-        raise DataError("parameters must be finite")
     return values
 
 
@@ -689,7 +721,12 @@ def is_usable_belief(mean: Array, covariance: Array) -> bool:
 
     It is finite, and its mean was measured (``gpmpc._arrays.UNMEASURED``).
     """
-    return _all_measured.unchecked(mean.ravel()) and _is_finite(covariance)
+    return all_measured(mean) and _is_finite(covariance)
+
+
+def all_measured(values: Array) -> bool:
+    """Tells whether all numbers of a contiguous array were measured."""
+    return _all_measured.unchecked(values.ravel())
 
 
 def _is_finite(values: Array) -> bool:

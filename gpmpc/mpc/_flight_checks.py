@@ -868,6 +868,8 @@ def _follow_bounds(settings, memory, input, distance):
         if input[j] != input[j]:
             continue
         size = _ROUNDING * max(1.0, abs(input[j]))
+        if settings.upper[j] - settings.lower[j] <= size:  # it is locked
+            continue
         is_low = input[j] <= settings.lower[j] + size
         if is_low or input[j] >= settings.upper[j] - size:
             # It is infinite until a distance is known.

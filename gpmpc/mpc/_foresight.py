@@ -113,7 +113,9 @@ class Foresight:
         self.longest = max(_HORIZONS * controller.horizon, _STAGES)
         self._model = controller.prediction.model
         self._roll_out = RollOut(self._model)
-        self._holding_stages = max(_FEWEST, controller.horizon // _HOLDING_PART)
+        holding_stages = max(_FEWEST, controller.horizon // _HOLDING_PART)
+        # No plan is longer than its horizon.
+        self._holding_stages = min(holding_stages, controller.horizon)
         self._negligible = _negligible_cost(controller.prediction.problem)
         horizons = (controller.horizon // 2, controller.horizon // 4)
         shorter = [
@@ -236,7 +238,8 @@ class Foresight:
         controller = self.controller
         m = controller.prediction.problem.input_dim
         lower, upper = (side[0] for side in controller.prediction.problem.inputs.sides)
-        pushed = np.flatnonzero(np.isfinite(upper - lower))
+        room = upper - lower
+        pushed = np.flatnonzero((room > 0.0) & np.isfinite(room))
         for j, i, sign in product(pushed, range(len(state)), (1.0, -1.0)):
             gains = np.zeros((self.longest, m, len(state)))
             gains[1:, j, i] = sign * _RELAY * (upper[j] - lower[j])

@@ -115,11 +115,12 @@ def _estimate_disturbance(
 
     It comes from the estimate of the last decision and from the state that its input
     led to. Where its plan is of no use, the state was not measured, or the model has no
-    numbers there, the estimate stays as it was.
+    numbers there, the estimate stays as it was. After steps without a measurement the
+    error is that of all of them, and counts as its mean.
     """
     last_estimate = _last_estimate(prediction, last_decision)
     last_plan = request.last_plan
-    if last_plan is None or not request.finite:
+    if last_plan is None or last_plan.is_used_up or not request.finite:
         return last_estimate
     last_input = request.references.previous_input[None]
     try:
@@ -131,7 +132,7 @@ def _estimate_disturbance(
     error = state_difference(request.state, local.mean[0], prediction.angles)
     if not np.isfinite(error).all():
         return last_estimate
-    gain = prediction.settings.disturbance_gain
+    gain = prediction.settings.disturbance_gain / (1 + last_plan.unmeasured_steps)
     return last_estimate + gain * (error - last_estimate)
 
 
@@ -234,30 +235,38 @@ def _guess_covariances(
 
 
 def is_contradicted(guess: Plan, stages: Stages, ranges: Array) -> bool:
-    """Returns whether a model leads far away from a guess, at some stage.
+    """Returns whether a model leads far away from a guess, or nowhere, at some stage.
 
     Args:
         guess: A first plan.
         stages: Linearised along it; one that is held contradicts nothing.
-        ranges: Of the states in the model's data (n,).
+        ranges: Of the states in the model's data (n,), infinite where they are unknown.
     """
     if len(stages.next) != len(guess.inputs):
         return False
-    return _leads_away(stages.next, guess.states, MOST_RANGES * ranges)
+    return _leads_away(stages.next, stages.A, stages.B, guess.states, ranges)
 
 
 @compiled
-def _leads_away(after, states, limits):
-    """Returns whether states (H + 1, p) are further from ``after`` than their limits.
+def _leads_away(after, A, B, states, ranges):
+    """Returns whether states (H + 1, p) are too far from ``after``, or that no number.
 
-    ``after`` (H, p) is where the model leads from each stage; the limits are of the
-    first n states (n,).
+    ``after`` (H, p) is where the model leads from each stage, with the derivatives
+    A (H, p, p) and B (H, p, m); the ranges are of the first n states (n,).
     """
+    derivatives = 0.0
     for k in range(len(after)):
-        for i in range(len(limits)):
-            if abs(after[k, i] - states[k + 1, i]) > limits[i]:
+        for i in range(len(ranges)):
+            distance = abs(after[k, i] - states[k + 1, i])
+            # One that is no number is within no range.
+            if not (distance <= MOST_RANGES * ranges[i] and distance < np.inf):
                 return True
-    return False
+        for i in range(A.shape[1]):
+            for j in range(A.shape[2]):
+                derivatives += 0.0 * A[k, i, j]
+            for j in range(B.shape[2]):
+                derivatives += 0.0 * B[k, i, j]
+    return derivatives != 0.0
 
 
 def open_loop_plan(prediction: PredictionModel, guess: Plan, request: Request) -> Plan:

@@ -348,8 +348,9 @@ class PredictionModel:
         """Returns the problem at a plan from its stages: covariances, rows, cost."""
         cost = self.costs.at(plan, request.parameters)
         covariances = self._covariances_of(plan, stages, cost, request)
-        if self.is_held and request.last_plan is not None:
-            stages = self._in_increments(plan, stages, request, request.last_plan)
+        last_plan = request.last_plan
+        if self.is_held and last_plan is not None and not last_plan.is_used_up:
+            stages = self._in_increments(plan, stages, request, last_plan)
         rows = self.constraints.at(
             plan, covariances, self.stage_count, request.parameters, request.kappas
         )
@@ -366,7 +367,7 @@ class PredictionModel:
             return Status.SOLVED
         if self.misses_hard_rows(local, KEPT):
             return Status.HARD_BOUND_MISSED
-        if local.row_violations().max() > KEPT:
+        if not local.row_violations().max() <= KEPT:
             return Status.SOFT_BOUND_MISSED
         return Status.SOLVED  # what is missed is a bound of inputs, by rounding
 
@@ -422,14 +423,21 @@ class PredictionModel:
     ) -> Stages:
         """Returns a held linearisation as that of the increments since s_{-1}.
 
-        s_{-1} is the state that the last decision began at.
+        s_{-1} is the state that the last decision began at. Where that was not
+        measured, what the plan did not foresee is due to all steps since then, and
+        counts as its mean.
         """
-        last_mean = previous.means[:1]
+        last_means = previous.means[:3]
         if self.angles:
-            last_mean = last_mean + full_turns(request.state - last_mean, self.angles)
-        last_state = self.linearizer.state(last_mean, previous.covariances[:1])[0]
+            turns = full_turns(request.state - last_means[0], self.angles)
+            last_means = last_means + turns
+        last_states = self.linearizer.state(last_means, previous.covariances[:3])
         last_input = request.references.previous_input
-        c = plan.states[0] - stages.A[0] @ last_state - stages.B[0] @ last_input
+        c = plan.states[0] - stages.A[0] @ last_states[0] - stages.B[0] @ last_input
+        if previous.unmeasured_steps:
+            foreseen = last_states[2] - stages.A[0] @ last_states[1]
+            foreseen -= stages.B[0] @ previous.inputs[1]
+            c = foreseen + (c - foreseen) / (1 + previous.unmeasured_steps)
         if not request.covariance.any():
             n = self.state_dim
             c[n:] = stages.c[0, n:]

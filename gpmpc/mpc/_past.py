@@ -15,7 +15,7 @@ from gpmpc._arrays import is_measured
 from gpmpc._dynamics import Array, linearize, to_array
 from gpmpc.gaussian import Gaussian
 from gpmpc.models._past import ModelWithPast, belief_of_all, has_past
-from gpmpc.mpc._controller import Decision, Reference, model_of
+from gpmpc.mpc._controller import Decision, Reference, all_measured, model_of
 from gpmpc.mpc._sqp import FAILURES
 from gpmpc.signals import signals_of
 
@@ -101,19 +101,25 @@ def _state(
     last_state: Array | None,
     last_input: Array,
 ) -> Array | None:
-    """Returns the state (n,) of now; None where nothing is known of it."""
+    """Returns the state (n,) of now; None where nothing is known of it.
+
+    Where the model has no numbers it is the last one that had some: means over the past
+    would keep what is none for ever.
+    """
     is_known = is_measured(measured).all()
     if last_state is None:
         return model.at_rest(measured, last_input) if is_known else None
-    if not is_known:
-        try:
-            local = linearize(
-                model, last_state[None], last_input[None], covariance=False
-            )
-        except FAILURES:  # where the model has no numbers
-            return None
-        return local.mean[0]
-    return model.follow(last_state, last_input, measured)
+    if is_known:
+        state = model.follow(last_state, last_input, measured)
+        if all_measured(state):
+            return state
+        return model.at_rest(measured, last_input)
+    try:
+        local = linearize(model, last_state[None], last_input[None], covariance=False)
+    except FAILURES:
+        return last_state
+    state = local.mean[0]
+    return state if all_measured(state) else last_state
 
 
 def _reference_of_all(reference: Reference, state: Array, n: int) -> Reference:

@@ -41,6 +41,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._controller import (
     Controller,
     Decision,
+    ParametersNotFinite,
     Reference,
     Timing,
     is_usable_belief,
@@ -101,13 +102,14 @@ def decide(
     """Decides one step's input: by the controller, or by the policy where that fails.
 
     ``"previous_plan"`` goes on along the last applicable plan, ``"hold"`` keeps the
-    last input applied, ``"raise"`` stops. Before the first such plan, the first two
-    take the reference's own input if there is one, else the controller's initial input,
-    within its input and rate bounds.
+    last input applied once there is such a plan, ``"raise"`` stops. Before it, the
+    first two take the reference's own input if there is one, else the controller's
+    initial input, within its input and rate bounds.
 
     Args:
         controller: It is called where the belief is finite and below 1e30 in size;
-            beyond are marks of sensors that saw nothing, such as 3.4e38.
+            beyond are marks of sensors that saw nothing, such as 3.4e38. What it
+            decides counts where the parameters are finite.
         belief: What is known of the state.
         reference: Over the horizon, or a set point.
         last: Command of the step before; None at the first.
@@ -130,9 +132,11 @@ def decide(
     decision = None
     if _is_usable(situation.belief):
         previous = None if last is None else last.plan
-        decision = _control(
-            controller, situation.belief, situation.reference, previous, options
-        )
+        # What parameters say, such as where an obstacle is, is measured, too.
+        with suppress(ParametersNotFinite):
+            decision = _control(
+                controller, situation.belief, situation.reference, previous, options
+            )
     return _conclude(controller, decision, situation, last, on_failure, step)
 
 
@@ -245,9 +249,9 @@ class ControlLoop:
 
     It holds what one step needs of the last. What ``input`` returns is finite, and
     within the bounds and rates of the controller's problem, whatever happened: a
-    measurement that is not finite or 1e30 or more in size, a program without a
-    solution, an error of the numbers. Before the first plan that is the reference's
-    input, or the controller's initial one.
+    measurement that is not finite or 1e30 or more in size, parameters that are not
+    finite, a program without a solution, an error of the numbers. Before the first
+    plan that is the reference's input, or the controller's initial one.
 
     Args:
         controller: With a problem and an initial input.
@@ -303,6 +307,7 @@ class ControlLoop:
         Raises:
             ShapeError: State, reference, parameters or plan have other dimensions than
                 the controller.
+            DataError: A reference, or a plan, that is not finite.
             SettingError: The controller takes no parameters, or no plan.
             SolverFailure: The policy is ``"raise"``.
         """
@@ -530,11 +535,14 @@ def _plan_of_policy(
 ) -> Decision | None:
     """Returns the last plan one step on, with the input of the policy as its first.
 
-    None where there is none to be applied.
+    None where there is none to be applied. What an input that was held once leads to is
+    not planned: the plan then counts as used up.
     """
     if last is None or last.plan is None or not last.plan.applicable:
         return None
     plan = _shifted(last.plan)
+    if on_failure == "hold" and plan.unmeasured_steps > 1:
+        plan = replace(plan, unmeasured_steps=len(plan.inputs))
     input = _input_of_policy(on_failure, plan, last)
     # bounds may change from stage to stage
     input = _within_bounds(controller, input, last.input)
@@ -563,6 +571,7 @@ def _shifted(plan: Decision) -> Decision:
         inputs=one_step_on(plan.inputs),
         means=one_step_on(plan.means),
         covariances=one_step_on(plan.covariances),
+        unmeasured_steps=plan.unmeasured_steps + 1,
         stage_costs=np.empty(0),  # those of the plan before it was shifted
         violation=math.nan,  # likewise
     )

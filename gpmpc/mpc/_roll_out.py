@@ -131,6 +131,10 @@ class Outcome(NamedTuple):
         return misses_no_more and self.cost < ratio * other.cost
 
 
+#: what inputs lead to where the model, a constraint or an output has no number
+OUT_OF_NUMBERS = Outcome(cost=np.inf, soft_price=np.inf, hard_miss=np.inf)
+
+
 def outcome_of_inputs(
     prediction: PredictionModel,
     local: LocalProblem,
@@ -156,7 +160,7 @@ def outcome_of_inputs(
     )
     states = batch[0]
     if not np.isfinite(states).all():
-        return Outcome(cost=np.inf, soft_price=np.inf, hard_miss=np.inf)
+        return OUT_OF_NUMBERS
     n = prediction.state_dim
     plan = prediction.plan_of(states, inputs, np.zeros((len(states), n, n)))
     references = request.references

@@ -499,7 +499,8 @@ def _cost_of_step(cost, references, plan, proposed):
     )
     states = proposed.states - plan.states
     inputs = proposed.inputs - plan.inputs
-    return evaluate_cost(cost, states, inputs, zero, 0.0)
+    # Rounding may leave a zero below it, where a difference of states is weighed.
+    return max(evaluate_cost(cost, states, inputs, zero, 0.0), 0.0)
 
 
 @njit_inner

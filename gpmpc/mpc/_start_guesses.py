@@ -118,7 +118,8 @@ def kicks(
 ) -> list[Array]:
     """Returns guesses of inputs (H, m) that push the plant to and fro.
 
-    The first holds the initial input; for each bounded input follow a push and a pull,
+    The first holds the initial input; for each bounded input that is not
+    locked follow a push and a pull,
     and a pull and a push, of H/6 stages each.
 
     Args:
@@ -146,7 +147,8 @@ def kicks(
     for j, (first, second) in product(
         range(problem.input_dim), ((upper, lower), (lower, upper))
     ):
-        if not np.isfinite([first[j], second[j]]).all():
+        room = abs(first[j] - second[j])
+        if room == 0.0 or not np.isfinite(room):
             continue
         inputs = drift.copy()
         inputs[:length, j] += share * (first[j] - initial_input[j])

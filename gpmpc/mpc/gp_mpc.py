@@ -65,6 +65,7 @@ from gpmpc.mpc._novelty import data_scales, novelty_of, novelty_when_read
 from gpmpc.mpc._priced_solver import PricedSolver
 from gpmpc.mpc._roll_out import (
     MISS_RATIO,
+    OUT_OF_NUMBERS,
     Outcome,
     close_defects,
     outcome_of_inputs,
@@ -181,6 +182,10 @@ class GPMPC:
             self._most_programs = 1
         #: what novelty is measured by; see ``with_model``
         self.data_scales = data_scales(model)
+        # Of the states in the model's data (n,); infinite where none are known.
+        self._state_ranges = np.full(self.prediction.state_dim, np.inf)
+        if self.data_scales is not None:
+            self._state_ranges = self.data_scales.ranges
 
     @property
     def most_programs(self) -> int:
@@ -272,13 +277,13 @@ class GPMPC:
         """Returns the problem at the first guess, or at what its inputs lead to.
 
         The latter where the model contradicts the guess: derivatives along states that
-        no motion takes, multiplied over the horizon, may grow beyond any number. States
-        that were handed over are taken as they are.
+        no motion takes, multiplied over the horizon, may grow beyond any number; and
+        where it has no number at a stage. States that were handed over are taken as
+        they are.
         """
-        scales = self.data_scales
-        if scales is None or request.guessed_states is not None:
+        if request.guessed_states is not None:
             return local
-        if not is_contradicted(local.plan, local.stages, scales.ranges):
+        if not is_contradicted(local.plan, local.stages, self._state_ranges):
             return local
         motion = open_loop_plan(self.prediction, local.plan, request)
         return self.prediction.linearize(motion, request)
@@ -340,7 +345,7 @@ class GPMPC:
                 local, request, stopwatch, self._most_programs
             )
             pays = thorough.applicable and self._pays(thorough, quick, local, request)
-        except FAILURES:  # more programs, or a plan's inputs, led out of its numbers
+        except FAILURES:  # more programs led out of the model's numbers
             return quick
         stopwatch.lap("model")
         return replace(
@@ -371,9 +376,12 @@ class GPMPC:
         self, decision: Decision, local: LocalProblem, request: Request
     ) -> Outcome:
         """Returns what the inputs of a decision lead to in the model."""
-        return outcome_of_inputs(
-            self.prediction, local, decision.inputs, decision.covariances, request
-        )
+        try:
+            return outcome_of_inputs(
+                self.prediction, local, decision.inputs, decision.covariances, request
+            )
+        except FAILURES:
+            return OUT_OF_NUMBERS
 
     def control_many(
         self,

@@ -223,7 +223,8 @@ def questions(controller, steps, seed=0):
     state = np.zeros(n)
     for k in range(steps):
         state = 0.9 * state + rng.normal(0, 0.3, n)
-        measured = state if k % 9 != 5 else np.full(n, LOST[k % len(LOST)])
+        is_lost = k % 9 in (1, 5, 6)
+        measured = np.full(n, LOST[k % len(LOST)]) if is_lost else state
         path = np.zeros((H + 1, n))
         path[:, 0] = np.sin(0.1 * (k + np.arange(H + 1)))
         inputs = 0.2 * np.cos(0.1 * (k + np.arange(H)))[:, None]
@@ -466,6 +467,21 @@ def test_parameters_come_with_every_call():
             loop.input(np.zeros(2), np.zeros(2))
 
 
+def test_parameters_that_are_lost_cost_one_step():
+    controller = obstacle()
+    compiled = CompiledLoop(controller, compiler=COMPILER)
+    python = ControlLoop(controller)
+    known = np.asarray(PLACES, dtype=float)
+    for parameters in (known, np.full_like(known, np.nan), known):
+        expected = python.input([0.3, 0.0], np.zeros(2), parameters)
+        got = compiled.input([0.3, 0.0], np.zeros(2), parameters)
+        assert got == pytest.approx(expected)
+        assert python.last is not None
+        assert compiled.status is python.last.status
+        is_lost = compiled.status is Status.INVALID_MEASUREMENT
+        assert is_lost == np.isnan(parameters).any()
+
+
 def test_references_are_refused_as_python_refuses_them():
     controller = gpmpc(
         Problem(Tracking([1.0, 0.1], [0.05], penalized="deviations"), TORQUES)
@@ -548,5 +564,11 @@ def test_an_estimate_stays_where_the_model_has_no_numbers():
     got = compiled.control(belief, goal, last)
     assert expected.disturbance is not None
     assert expected.disturbance[0] == 0.05
+    assert got.status is expected.status is Status.SOLVED
+    assert np.abs(got.inputs - expected.inputs).max() < 1e-9
+    # A first guess, on a line to below empty, is left for what its inputs lead to.
+    empty = Reference(np.array([-5.0, 0.0]))
+    expected = controller.control(belief, empty)
+    got = compiled.control(belief, empty)
     assert got.status is expected.status is Status.SOLVED
     assert np.abs(got.inputs - expected.inputs).max() < 1e-9

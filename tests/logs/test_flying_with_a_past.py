@@ -24,6 +24,7 @@ from gpmpc.mpc import (
     Inequality,
     LeastSquares,
     ManyStarts,
+    PredictionSettings,
     Problem,
     Tracking,
     beyond_data,
@@ -292,3 +293,39 @@ def test_models_of_logs_are_compared_by_identity():
     assert one != other
     assert one.model != other.model
     assert one.model in [other.model, one.model]
+
+
+class Draining(KnownModel):
+    """A level, of which the mean of the logarithm is remembered."""
+
+    measured_dim = 1
+    past = 30
+
+    def __init__(self):
+        def drain(x, u):
+            mean = 0.9 * x[..., 1] + 0.1 * torch.log(x[..., 0])
+            return torch.stack([x[..., 0] + u[..., 0] - 0.4, mean], dim=-1)
+
+        super().__init__(drain, 2, 1)
+
+    def at_rest(self, measured, input):
+        return np.array([measured[0], np.log(measured[0])])
+
+    def follow(self, state, input, measured):
+        mean = 0.9 * state[1] + 0.1 * np.log(state[0])
+        return np.array([measured[0], mean])
+
+
+@pytest.mark.parametrize("missing", [3, 4, 9])
+def test_a_past_heals_after_a_gap_that_left_the_numbers(missing):
+    problem = Problem(Tracking([1.0], [0.1]), Box([0.0], [0.1]))
+    settings = PredictionSettings(covariance="none")
+    pilot = GPMPC(Draining(), Linearization(), problem, 2, [0.0], settings)
+    loop = ControlLoop(pilot)
+    with np.errstate(invalid="ignore"):
+        for level in (1.0, *[np.nan] * missing, 1.0, 0.9):
+            loop.input([level], [1.0])
+    assert loop.failures == missing
+    assert loop.last is not None
+    assert loop.last.state is not None
+    assert np.isfinite(loop.last.state).all()

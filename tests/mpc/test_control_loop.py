@@ -8,6 +8,7 @@ from gpmpc.mpc import (
     GPMPC,
     Box,
     ControlLoop,
+    Inequality,
     PredictionSettings,
     Problem,
     Reference,
@@ -225,3 +226,20 @@ def test_an_error_of_the_numbers_of_the_estimate_costs_no_input():
     assert loop.last.decision.disturbance == pytest.approx(estimate)
     loop.input(x, GOAL, plan=np.zeros((10, 1)))
     assert loop.failures == 0
+
+
+def test_parameters_that_are_not_finite_cost_one_step():
+    """An obstacle that its tracker has lost for a step."""
+
+    def outside(x, p):
+        return 0.1 - (x[:, 0] - p[:, 0]) ** 2
+
+    problem = Problem(PROBLEM.cost, BOX, RATES, [Inequality(outside, penalty=1.0)])
+    loop = ControlLoop(controller(problem))
+    loop.input(np.zeros(2), GOAL, parameters=[3.0])
+    planned = loop.last.plan.inputs[1]
+    applied = loop.input(np.zeros(2), GOAL, parameters=[np.nan])
+    assert loop.last.status is Status.INVALID_MEASUREMENT
+    assert applied == pytest.approx(planned)
+    loop.input(np.zeros(2), GOAL, parameters=[3.0])
+    assert loop.failures == 1

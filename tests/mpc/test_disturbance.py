@@ -252,3 +252,50 @@ def test_an_estimate_outlives_a_missing_measurement_without_a_loop():
     assert np.array_equal(blind.disturbance, decisions[-1].disturbance)
     again = mpc.control(Gaussian.certain(states[-1]), AT_REST, blind)
     assert np.array_equal(again.disturbance, decisions[-1].disturbance)
+
+
+@pytest.mark.parametrize(
+    ("settings", "missing"),
+    [
+        ({"disturbance_gain": 0.3}, 1),
+        ({"disturbance_gain": 0.3}, 4),
+        ({"form": "velocity"}, 1),
+        ({"form": "velocity"}, 4),
+    ],
+)
+def test_a_gap_teaches_the_mean_error_of_its_steps(settings, missing):
+    """An integrator that is pushed from just before the gap on."""
+    pushed = 0.1
+    integrator = KnownModel(lambda x, u: x + u, 1, 1)
+    steering = GPMPC(
+        integrator,
+        Linearization(),
+        Problem(Tracking([1.0], [0.1]), Box([-2.0], [2.0])),
+        H,
+        [0.0],
+        PredictionSettings(covariance="none", **settings),
+    )
+    loop = ControlLoop(steering)
+    state = np.zeros(1)
+    loop.input(state, [0.0])
+    for k in range(missing + 1):
+        state = state + loop.last.input + pushed
+        is_missing = k < missing
+        loop.input([np.nan] if is_missing else state, [0.0])
+    decision = loop.last.decision
+    learned = decision.means[1] - decision.means[0] - decision.inputs[0]
+    gain = settings.get("disturbance_gain", 1.0)
+    assert learned == pytest.approx(gain * pushed)
+
+
+def test_a_plan_that_is_used_up_teaches_nothing():
+    """Nor does one beside which an input was held."""
+    integrator = KnownModel(lambda x, u: x + u, 1, 1)
+    problem = Problem(Tracking([1.0], [0.1]), Box([-2.0], [2.0]))
+    settings = PredictionSettings(covariance="none", disturbance_gain=0.3)
+    steering = GPMPC(integrator, Linearization(), problem, H, [0.0], settings)
+    for on_failure, missing in (("previous_plan", H), ("hold", 2)):
+        loop = ControlLoop(steering, on_failure)
+        for state in ([1.0], *[[np.nan]] * missing, [5.0]):
+            loop.input(state, [0.0])
+        assert loop.last.decision.disturbance == pytest.approx(0.0)

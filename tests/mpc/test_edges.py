@@ -165,3 +165,51 @@ def test_inputs_handed_over_lead_to_the_goal_in_their_turn():
     push[0] = -40.0
     decision = controller.control(at(0.0, 0.0), goal, last, plan=push)
     assert decision.means[-1, 0] < -2.5
+
+
+def test_a_distance_alone_that_rounds_below_zero_is_a_step():
+    """Two vehicles that move alike: what is weighed is a difference of large states."""
+
+    def both(x, u):
+        return x + u
+
+    rng = np.random.default_rng(0)
+    for _ in range(10):
+        Q = 10.0 ** rng.uniform(0, 6) * np.array([[1.0, -1.0], [-1.0, 1.0]])
+        cost = Tracking(Q, [1e-8], terminal=Q)
+        start, goal, first_input = 1e3 * rng.normal(size=3)
+        controller = GPMPC(
+            KnownModel(both, 2, 1),
+            Linearization(),
+            Problem(cost, Box([-1e5], [1e5])),
+            10,
+            [first_input],
+            PredictionSettings(covariance="none"),
+        )
+        apart = start + np.array([1e-6 * rng.normal(), 0.0])
+        decision = controller.control(
+            Gaussian.certain(apart), Reference(np.full(2, goal))
+        )
+        assert decision.status is Status.SOLVED
+        assert min(decision.steps, default=0.0) >= 0.0
+
+
+@pytest.mark.parametrize("level", [-0.1, -0.5])
+def test_a_line_to_where_the_model_has_no_number_is_no_guess(level):
+    """The set point of a tank is below empty, by what a sensor is off."""
+
+    def tank(x, u):
+        return x + 0.1 * (u - torch.sqrt(x))
+
+    problem = Problem(Tracking([1.0], [0.1]), Box([0.0], [2.0]))
+    controller = GPMPC(
+        KnownModel(tank, 1, 1),
+        Linearization(),
+        problem,
+        10,
+        [0.7],
+        PredictionSettings(covariance="none"),
+    )
+    decision = controller.control(at(0.5), Reference(np.array([level])))
+    assert decision.status is Status.SOLVED
+    assert decision.input[0] == pytest.approx(0.0, abs=1e-9)

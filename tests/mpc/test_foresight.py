@@ -244,6 +244,18 @@ def test_a_stage_beyond_a_hard_bound_says_nothing_of_arrival():
     assert not foresight.arrives(FlownCosts.joined([held, beyond]))
 
 
+def test_a_plan_of_a_short_horizon_arrives():
+    foresight = Foresight(controller(pendulum(), pendulum_problem(), 2))
+    assert foresight.arrives(errors_of(0.0, 0.0))
+
+
+def test_a_locked_input_takes_no_relays():
+    locked = Problem(pendulum_problem().cost, inputs=Box([0.0], [0.0]))
+    foresight = Foresight(controller(pendulum(), locked, 30))
+    at_rest = question(Reference(np.zeros((31, 2))))
+    assert not list(foresight.relays(np.array([3.0, 3.0]), at_rest))
+
+
 def test_what_a_bound_costs_says_nothing_of_how_near_the_goal_is():
     """A start beyond a soft bound, at its exact price, beside errors of ten."""
     foresight = Foresight(controller(pendulum(), pendulum_problem(), 20))

@@ -562,3 +562,14 @@ def test_names_of_another_number_of_states_are_refused():
     for names in ((["x"], ["u"]), (["x", "y"], ["u", "v"])):
         with pytest.raises(ShapeError, match="names must be of 2 states and 1 inputs"):
             FlightJudge(CONTROLLER.problem, names=names)
+
+
+def test_a_locked_input_is_not_at_its_bound():
+    box = Box([-1.0, 0.5], [1.0, 0.5])
+    judge = FlightJudge(Problem(Tracking([1.0, 0.0], [0.01, 0.01]), inputs=box))
+    for _ in range(60):
+        plan = plan_of(np.array([1.0, 0.0]))
+        inputs = np.tile([0.2, 0.5], (5, 1))
+        plan = replace(plan, input=inputs[0], inputs=inputs)
+        judgement = judge.judge(plan.means[0], np.zeros(2), plan)
+    assert "bound" not in judgement.reason

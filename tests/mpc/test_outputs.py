@@ -392,3 +392,18 @@ def test_a_cost_of_outputs_that_rounds_below_zero_is_none(goal):
             at = Gaussian.certain([goal, 0.0])
             last = steering.control(at, Reference([0.0, 0.0]), last)
             assert np.abs(last.input).max() < 1e-3
+
+
+def test_a_first_plan_whose_inputs_lead_out_of_an_output_gives_way():
+    """One program's inputs lead to a negative state; those of more do not."""
+    model = KnownModel(lambda x, u: x + 0.2 * (u - 2.455 * x), 1, 1)
+    output = LeastSquares(torch.log, [0.121], reference=[-0.7024])
+    problem = Problem(
+        Tracking([1e-3], [4.1e-3]), Box([-10.0], [10.0]), outputs=[output]
+    )
+    settings = PredictionSettings(covariance="none")
+    steering = GPMPC(model, Linearization(), problem, 10, [2.1537], settings)
+    decision = steering.control(Gaussian.certain([2.2729]), Reference([0.4954]))
+    assert decision.status is Status.SOLVED
+    states = steering.prediction.lead(np.array([2.2729]), decision.inputs)
+    assert states.min() > 0.0

@@ -549,10 +549,10 @@ def test_what_cannot_be_searched_is_refused():
 
 def test_kicks_push_every_input_to_both_sides_within_its_bounds():
     problem = Problem(
-        Tracking([1.0], [1.0, 1.0], penalized="inputs"),
-        inputs=Box([0.0, -1.0], [2.0, np.inf]),
+        Tracking([1.0], [1.0, 1.0, 1.0], penalized="inputs"),
+        inputs=Box([0.0, -1.0, 0.3], [2.0, np.inf, 0.3]),
     )
-    guesses = kicks(problem, 12, np.array([0.5, 0.0]))
+    guesses = kicks(problem, 12, np.array([0.5, 0.0, 0.3]))
     assert [inputs[0, 0] for inputs in guesses] == [0.5, 1.25, 0.25]
     assert all(
         (inputs[:, 0] >= 0).all() and not inputs[:, 1].any() for inputs in guesses
@@ -561,11 +561,8 @@ def test_kicks_push_every_input_to_both_sides_within_its_bounds():
         [1.25, 1.25, 0.25, 0.25, 0.5, 0.5],
         [0.25, 0.25, 1.25, 1.25, 0.5, 0.5],
     ]
-    assert kicks(problem, 3, np.array([0.5, 0.0]), share=1.0)[1][:, 0].tolist() == [
-        2.0,
-        0.0,
-        0.5,
-    ]
+    whole = kicks(problem, 3, np.array([0.5, 0.0, 0.3]), share=1.0)[1]
+    assert whole[:, 0].tolist() == [2.0, 0.0, 0.5]
 
 
 @pytest.mark.parametrize("starts", [3, pytest.param(20, marks=pytest.mark.slow)])
