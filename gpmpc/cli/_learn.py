@@ -568,6 +568,14 @@ def _doubts(
             "past says may correct them: a controller plans with the movement alone, "
             "from its own estimate."
         )
+    noise = learned.noise
+    correlated = noise.outputs[np.array(noise.time_constants) > 0]
+    if correlated.any():
+        doubts.append(
+            "The intervals that were judged hold errors that are alike for several "
+            "rows, and follow those of the run. A controller's tube does neither: it "
+            "takes the noise as white, and is too narrow many steps ahead."
+        )
     doubts.append("Outside the ranges of the data (table above) nothing was seen.")
     if learned.model.feedback_outputs:
         doubts.append(

@@ -10,7 +10,7 @@ import numpy as np
 import pandas
 import pytest
 
-from gpmpc.cli._learn import _reasons_against, _save_model
+from gpmpc.cli._learn import _doubts, _reasons_against, _save_model
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.logs import (
     Log,
@@ -287,6 +287,13 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
     assert judgement.runs == (run.name,)
     (sentence,) = short_pieces(learned, judgement, pieces, train)
     assert "42% of the held-out rows" in sentence
+    # A tube takes all noise as white.
+    for correlated in (0.0, 1e-4):
+        outputs = learned.noise.outputs.copy()
+        outputs[1:] = correlated
+        noise = replace(learned.noise, outputs=outputs)
+        doubts = _doubts(replace(learned, noise=noise), judgement, pieces, train)
+        assert any("A controller's tube" in one for one in doubts) == (correlated > 0)
     # Of short pieces the baselines are fitted to fewer steps.
     short = [replace(run, begins=tuple(range(0, 500, 70))) for run in train]
     train = replace(train, runs=tuple(short))
