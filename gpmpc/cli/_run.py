@@ -298,7 +298,7 @@ class _Recordings:
         with McapRecorder(
             next(self._paths),
             replace(self._system, input_bounds=[side[0] for side in bounds]),
-            metadata=self._metadata(training),
+            metadata=self._metadata(training, controller),
             config=self._yaml_text,
             live=self._live,
         ) as recorder:
@@ -325,11 +325,11 @@ class _Recordings:
         model = self._experiment.model if training is None else training.posterior
         return len(model) if isinstance(model, Sized) else 0
 
-    def _metadata(self, training: Any) -> dict[str, Any]:
+    def _metadata(self, training: Any, controller: Any) -> dict[str, Any]:
         """Returns what a reader of the recording needs besides its steps."""
         experiment = self._experiment
         system = experiment.system
-        noise = experiment.unplanned_noise(training).tolist()
+        noise = experiment.unplanned_noise(training, controller).tolist()
         return {
             "seed": experiment.seed,
             "command": self._command,

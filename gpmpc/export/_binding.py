@@ -205,6 +205,9 @@ def _address(array: Array) -> ctypes.c_void_p:
 class CompiledController:
     """A ``GPMPC`` as compiled C: a ``Controller`` that decides as it does.
 
+    Its decisions hold the means of a plan alone: the covariances, by which it keeps
+    chance constraints, stay in the code.
+
     Args:
         controller: What is exported, of one program a step.
         precision: Of all numbers, ``"double"`` or ``"float"``.
@@ -231,6 +234,14 @@ class CompiledController:
         self.horizon = controller.horizon
         self.problem = controller.problem
         self.initial_input = controller.initial_input
+
+    #: what its decisions say of a plan leaves out all noise, whatever it plans with
+    plans_means_alone = True
+
+    @property
+    def model(self) -> DynamicsModel:
+        """The model that it predicts with."""
+        return self.source.prediction.model
 
     @property
     def signals(self) -> Signals:

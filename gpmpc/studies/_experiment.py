@@ -147,7 +147,9 @@ class Experiment:
         """Returns the states to follow (count, n), one per time step."""
         return self.system.reference_states(self.trajectory, count)
 
-    def unplanned_noise(self, training: Training | None) -> np.ndarray:
+    def unplanned_noise(
+        self, training: Training | None, controller: Any = None
+    ) -> np.ndarray:
         """Returns the noise of a next state that the covariances of a plan leave out.
 
         It is what the model has learned of it; a controller that knows the plant knows
@@ -155,13 +157,16 @@ class Experiment:
 
         Args:
             training: What was learned for the flight; None where nothing was.
+            controller: That flies, where it is known: compiled code tells the means of
+                its plans alone.
 
         Returns:
             Standard deviations (n,), in the units of the states.
         """
         nothing = np.zeros(len(self.system.state_names))
         settings = getattr(self.controller, "keywords", {}).get("prediction")
-        plans_means_alone = getattr(settings, "covariance", "") == "none"
+        plans_means_alone = getattr(controller, "plans_means_alone", False)
+        plans_means_alone |= getattr(settings, "covariance", "") == "none"
         propagates_noise = getattr(self.propagator, "process_noise", False)
         is_planned = propagates_noise and not plans_means_alone
         is_noiseless = self.loop == "model"  # rolled on itself, by its means

@@ -38,6 +38,7 @@ def outlook(
     if model is not None:
         far_from_data = [str(warning) for warning in beyond_data(model, reference)]
     stability = None
+    controller = getattr(controller, "source", controller)  # of compiled code
     if isinstance(controller, GPMPC):
         # What cannot be judged, such as outputs of parameters, is no reason not to fly.
         with suppress(GpmpcError, np.linalg.LinAlgError):

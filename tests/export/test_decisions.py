@@ -33,9 +33,11 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
+from gpmpc.mpc._judgement import _learned_noise
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import ModelLoop, closed_loop
 from gpmpc.status import Status
+from gpmpc.studies._outlook import outlook
 from tests.mpc.small_models import pendulum_posterior
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
@@ -436,8 +438,17 @@ def test_of_another_controllers_decision_the_input_counts():
 
 
 def test_a_controller_serves_many_threads():
-    compiled = CompiledController(gpmpc(Problem(WEIGHTS, TORQUES)), compiler=COMPILER)
+    """What is known of a flight with it is what is known of one by Python."""
+    source = gpmpc(Problem(WEIGHTS, TORQUES))
+    compiled = CompiledController(source, compiler=COMPILER)
     origin = Reference(np.zeros(2))
+    assert outlook(compiled, GP, origin) == outlook(source, GP, origin)
+    assert outlook(compiled, GP, origin).spectral_radius > 0
+    # its decisions hold means alone, beside which the model's noise counts
+    of_means = gpmpc(Problem(WEIGHTS, TORQUES), covariance="none")
+    noise = _learned_noise(of_means)
+    assert (_learned_noise(compiled) == noise).all()
+    assert (noise > 0).all()
     beliefs = [Gaussian.certain([0.005 * k, -0.2]) for k in range(200)]
 
     def decide(belief):

@@ -352,6 +352,9 @@ def test_a_plan_leaves_out_what_a_learned_model_takes_for_noise():
     alone = partial(means_alone.controller, prediction=means)
     alone = replace(means_alone, controller=alone)
     assert alone.unplanned_noise(None).tolist() == [2, 3]
+    compiled = SimpleNamespace(plans_means_alone=True)
+    held = experiment(model=noisy, propagator=holding)
+    assert held.unplanned_noise(None, compiled).tolist() == [2, 3]
 
 
 def test_episodes_train_their_models():
