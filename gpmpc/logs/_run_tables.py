@@ -86,7 +86,14 @@ def tabulate(
     for signal in mapping.signals:
         topic = topics[signal.topic]
         is_kept = _kept_rows(topic, mapping)
-        values = read_signal(topic.where, topic.table, signal, findings, is_kept)
+        values = read_signal(
+            topic.where,
+            topic.table,
+            signal,
+            findings,
+            is_kept=is_kept,
+            follows=_following_rows(topic.stamps),
+        )
         samples = Samples(topic.stamps.time, values)
         columns.append(_signal_on_grid(samples, grid, signal, mapping, findings))
         _note_own_rate(samples, grid, signal, mapping, findings)
@@ -385,6 +392,15 @@ def _kept_rows(topic: _Topic, mapping: LogMapping) -> np.ndarray:
             values = read_column(topic.where, topic.table, column)
             is_kept &= (values >= low) & (values <= high)
     return is_kept
+
+
+def _following_rows(stamps: Stamps) -> np.ndarray:
+    """Finds the rows (K,) that stand a usual time step behind the row before."""
+    steps = np.diff(stamps.time)
+    if not len(steps):
+        return np.zeros(len(stamps.time), dtype=bool)
+    is_usual = steps <= USUAL_GAP * np.median(steps)
+    return np.r_[False, is_usual] & ~stamps.after_reversal
 
 
 def _rows_outside_of(

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
+from gpmpc._angles import wrap
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
 from gpmpc.logs._columns import check_column
@@ -20,9 +21,11 @@ from gpmpc.logs._findings import RunFindings
 from gpmpc.logs._mapping import Signal
 
 LARGEST_ANGLE = 4 * np.pi  # [rad]; larger ones count turns, or are degrees
-FEWEST_JUMPS = 2  # by more than half a turn: a gap may make one
+FEWEST_JUMPS = 2  # by more than half a turn: a wrong sample may make one
+WHOLE_TURNS = 0.5  # [rad] by which jumps of whole turns differ from the motion before
 NO_ATTITUDE = 1e-6  # norm: what an estimator writes before it has begun
 NORM_TOLERANCE = 0.05  # of unit quaternions
+MOST_OFF = 0.05  # of the samples of an attitude; beyond, they are no unit quaternions
 
 
 def read_column(where: str, table: pd.DataFrame, column: str) -> Array:
@@ -96,6 +99,7 @@ def read_signal(
     signal: Signal,
     findings: RunFindings,
     is_kept: np.ndarray,
+    follows: np.ndarray,
 ) -> Array:
     """Reads a signal (K, c) in the units and conventions of ``gpmpc.logs``.
 
@@ -105,6 +109,7 @@ def read_signal(
         signal: Says which columns, and in which units.
         findings: Takes what is missing.
         is_kept: Rows (K,) that will not be left out: no other has to be right.
+        follows: Rows (K,) that stand a usual time step behind the row before.
 
     Raises:
         DataError: A column cannot be read, angles are rather in degrees, or quaternions
@@ -121,7 +126,8 @@ def read_signal(
     findings.add("empty sample", absent.sum(), text)
     if signal.kind == "quaternion":
         return _unit_quaternions(where, values, signal, findings, is_kept)
-    _check_angles(where, values, signal, findings)
+    kept_values = np.where(is_kept[:, None], values, np.nan)
+    _check_angles(where, kept_values, signal, findings, follows)
     if signal.kind == "euler":
         return _euler_to_quaternions(values, present=~absent)
     return values
@@ -139,12 +145,17 @@ def _without_sentinels(column: str, numbers: Array, findings: RunFindings) -> Ar
 
 
 def _check_angles(
-    where: str, values: Array, signal: Signal, findings: RunFindings
+    where: str,
+    values: Array,
+    signal: Signal,
+    findings: RunFindings,
+    follows: np.ndarray,
 ) -> None:
     """Notes angles that are said to be radians and are large: they may be degrees.
 
     Angles that count turns are as large, but go from row to row by less than half a
-    turn.
+    turn, or by whole turns more where a counter of several begins anew. Over a gap they
+    go by any angle.
 
     Raises:
         DataError: They jump more than once, or are a roll or a pitch.
@@ -158,11 +169,24 @@ def _check_angles(
         f"{signal.name} reaches {largest.max():.4g} rad: are these degrees? (unit: deg)"
     )
     is_tilt = signal.kind == "euler" and largest[:2].max() > LARGEST_ANGLE
-    jumps = (np.abs(np.diff(values, axis=0)) > np.pi).sum()
-    if is_tilt or jumps >= FEWEST_JUMPS:
+    changes = np.diff(values, axis=0)
+    changes[~follows[1:]] = np.nan
+    if is_tilt or _count_jumps(changes) >= FEWEST_JUMPS:
         raise DataError(f"{where}: {text}")
     count = int((np.abs(values) > LARGEST_ANGLE).any(axis=1).sum())
     findings.add("large angle", count, f"{text} or does it count turns? left in")
+
+
+def _count_jumps(changes: Array) -> int:
+    """Counts changes (K, c) [rad] by more than half a turn, but for whole turns.
+
+    A change by whole turns goes on, less those, as the one before.
+    """
+    jumps = np.abs(changes) > np.pi
+    moves_before = np.abs(changes[:-1]) <= np.pi
+    accelerations = wrap(changes[1:] - changes[:-1])[jumps[1:] & moves_before]
+    is_whole = np.abs(accelerations) < WHOLE_TURNS
+    return int(jumps.sum()) if is_whole.sum() < 0.5 * jumps.sum() else 0
 
 
 def _euler_to_quaternions(angles: Array, present: np.ndarray) -> Array:
@@ -191,10 +215,11 @@ def _unit_quaternions(
     is_wrong = is_off & is_kept & ~is_empty
     if is_wrong.any():
         row = int(np.argmax(is_wrong))
-        raise DataError(
-            f"{where}: {signal.name} in row {row + 1} has norm {norms[row]:.4g}; "
-            "expected unit quaternions"
-        )
+        text = f"{signal.name} in row {row + 1} has norm {norms[row]:.4g}"
+        if is_wrong.sum() > MOST_OFF * is_kept.sum():
+            raise DataError(f"{where}: {text}; expected unit quaternions")
+        text = f"{text}, as {is_wrong.sum()} samples: no attitude, left out"
+        findings.add("norm", is_wrong.sum(), text)
     norms[is_off] = np.nan
     steady = _with_steady_signs(values / norms[:, None])
     text = f"{steady.flips} times: turned back"

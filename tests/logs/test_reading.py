@@ -286,9 +286,13 @@ def test_repeated_and_backward_stamps_are_counted(tmp_path):
         2,
         397,
     )
-    table["t"] = table["t"] % 2.0
-    with pytest.raises(DataError, match="time runs backwards in row 101"):
-        read_log(written(tmp_path, table), PENDULUM)
+    set_back = table.assign(t=table["t"] - 2.0 * (table.index >= 200))
+    with pytest.raises(DataError, match="time runs backwards in row 101 .* a file"):
+        read_log(written(tmp_path, set_back), PENDULUM)
+    wrapped = table.assign(t=table["t"] % 2.0)
+    log = read_log(written(tmp_path, wrapped), PENDULUM)
+    assert kinds(log)["clock began anew"] == 3
+    assert kinds(log)["stamp runs backwards"] == 2
 
 
 def test_missing_values_are_boundaries(tmp_path):
@@ -418,6 +422,19 @@ def test_angles_may_count_turns(tmp_path):
     log = read_log(written(tmp_path, table), mapping)
     np.testing.assert_allclose(log.runs[0].states[:, 0], table["angle"])
     assert "does it count turns?" in log.findings[0].text
+    paused = table.drop(index=[*range(100, 140), *range(200, 240)])
+    log = read_log(written(tmp_path, paused), mapping)
+    np.testing.assert_allclose(log.runs[0].states[:, 0], paused["angle"])
+    for turns in (6, 7):
+        degrees = np.rad2deg(np.mod(turns * table["angle"] / 20, 2 * np.pi))
+        with pytest.raises(DataError, match="are these degrees"):
+            read_log(written(tmp_path, table.assign(angle=degrees)), mapping)
+    table["angle"] = np.mod(table["angle"], 16 * np.pi)  # a counter of eight turns
+    log = read_log(
+        written(tmp_path, pandas.concat([table] * 3)),
+        {**mapping, "time": {"step": 0.02}},
+    )
+    assert "does it count turns?" in log.findings[0].text
     table["angle"] = np.rad2deg(wrap(table["angle"].to_numpy()))
     with pytest.raises(DataError, match="are these degrees"):
         read_log(written(tmp_path, table), mapping)
@@ -504,6 +521,22 @@ def test_a_quaternion_whose_sign_flips_is_the_same_attitude(tmp_path):
         log.space.difference(log.runs[0].states, expected.runs[0].states), 0, atol=1e-12
     )
     assert np.abs(np.diff(log.runs[0].states[:, 3:7], axis=0)).max() < 0.1
+
+
+def test_a_wrong_sample_of_an_attitude_is_left_out_and_many_are_refused(tmp_path):
+    table = body_table()
+    turns = Rotation.from_euler("ZYX", table[["yaw", "pitch", "roll"]])
+    table[["qx", "qy", "qz", "qw"]] = turns.as_quat()
+    mapping = changed(
+        BODY, "states", "attitude", columns=["qx", "qy", "qz", "qw"], kind="quaternion"
+    )
+    table.loc[100:101, ["qx", "qy", "qz", "qw"]] *= 0.9
+    log = read_log(written(tmp_path, table), mapping)
+    assert kinds(log) == {"norm": 2, "missing value": 2}
+    assert (len(log), log.runs[0].begins) == (298, (0, 100))
+    table.loc[100:130, ["qx", "qy", "qz", "qw"]] *= 0.9
+    with pytest.raises(DataError, match="row 101 has norm 0.81; expected unit quat"):
+        read_log(written(tmp_path, table), mapping)
 
 
 @pytest.mark.parametrize(
