@@ -301,7 +301,7 @@ class _Search:
             self._progress(f"compiling {count} points")
             controller, estimator = self._reduced(count)
             questions = self._flight.questions[:_REPLAYED]
-            self._footprints[key] = measure_footprint(
+            footprint = measure_footprint(
                 controller,
                 questions if replays and estimator is None else (),
                 chip=self._chip,
@@ -309,6 +309,10 @@ class _Search:
                 on_failure=self._on_failure,
                 estimator=estimator,
             )
+            if self._budget.ram is not None and footprint.stack is None:
+                rule = "ram holds the stack, which gcc 10 and newer tell; leave ram out"
+                raise SettingError("budget", f"{rule}; got {footprint.compiler}")
+            self._footprints[key] = footprint
         return self._footprints[key]
 
     def _reduced(self, count: int) -> tuple[GPMPC, Estimator | None]:

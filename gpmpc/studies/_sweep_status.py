@@ -135,7 +135,7 @@ class SweepWatch:
         ends: list[float] = []
         failures: Counter[str] = Counter()
         examples: dict[str, str] = {}
-        sweeps = [*_sweeps(str(self.tree))]
+        sweeps = [*self._sweeps()]
         for folder in sweeps:
             for path, state, ended in self._runs(folder):
                 counts[state] += 1
@@ -183,6 +183,16 @@ class SweepWatch:
                 if name in planned or os.path.exists(f"{path}/{CONFIG}"):
                     yield path, RunFolder(Path(path)).state, None
 
+    def _sweeps(self) -> Iterator[str]:
+        """Yields the folders that hold runs; one may be below another."""
+        for folder, children, _ in os.walk(self.tree):
+            planned = self._planned(folder)
+            others = [name for name in children if name not in planned]
+            no_runs = [name for name in others if not _is_run(f"{folder}/{name}")]
+            children[:] = no_runs
+            if planned or len(no_runs) < len(others):
+                yield folder
+
     def _planned(self, folder: str) -> set[str]:
         """Returns the names of the runs that the plans in a folder ask for."""
         names: set[str] = set()
@@ -203,15 +213,6 @@ class SweepWatch:
 def without_numbers(text: str) -> str:
     """Returns a text that is the same for texts that differ in numbers alone."""
     return re.sub(r"\d+", "0", text)
-
-
-def _sweeps(tree: str) -> Iterator[str]:
-    """Yields the folders that hold runs, not those below them."""
-    for folder, children, files in os.walk(tree):
-        is_sweep = any(name.startswith(PLAN_PREFIX) for name in files)
-        if is_sweep or any(_is_run(f"{folder}/{name}") for name in children):
-            children.clear()
-            yield folder
 
 
 def _is_run(path: str) -> bool:

@@ -282,6 +282,9 @@ def test_states_that_no_sensor_shows_cost_nothing(compiled):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gpmpc.export._choice.measure_footprint", footprint)
         choice = choose_points(controller, fly_late, Budget(flash=225), chip="host")
+        rule = "ram holds the stack.*; got formula"
+        with pytest.raises(SettingError, match=rule):
+            choose_points(controller, fly_late, Budget(ram=225), chip="host")
     assert choice.points == 22
     assert np.isfinite([row.error for row in choice.rows]).all()
 

@@ -109,7 +109,10 @@ def test_who_asks_for_data_does_not_wait_for_the_end(tree, monkeypatch):
 def test_sweeps_below_a_folder_are_counted_together(tree):
     plan(tree.parent / "other", [["seed=0"], ["seed=1"]])
     (tree.parent / "other" / f"{PLAN_PREFIX}damaged.json").write_text("{")
-    assert SweepWatch(tree.parent).look().total == 14
+    # a sweep below another, as of the best candidate of a search
+    run(tree / "best", "default", "config.yaml", "metrics.json", ended=time.time())
+    (tree.parent / f"{PLAN_PREFIX}notes.txt").touch()
+    assert SweepWatch(tree.parent).look().total == 15
 
 
 def test_a_folder_without_runs_is_a_mistake(tmp_path):
