@@ -23,7 +23,7 @@ from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._run_tables import RunTable, tabulate
 from gpmpc.logs._runs import split_into_runs
 from gpmpc.logs._time_step import find_time_step
-from gpmpc.logs._usable_rows import least_motion, select_rows
+from gpmpc.logs._usable_rows import UNCHANGING, least_motion, select_rows
 
 MOST_UNLIKE_SPREAD = 30.0  # of two entries of one signal
 
@@ -78,6 +78,7 @@ def read_log(
         run = select_rows(table, step, rest_ranges, mapping, run_findings)
         if run is not None:
             runs.append(run)
+    _check_unchanging(runs, findings)
     _check_content(runs, paths, findings)
     _note_unlike_entries(runs, mapping, findings)
     _note_equal_runs(runs, findings)
@@ -250,6 +251,18 @@ def _note_equal_runs(runs: Sequence[LogRun], findings: list[Finding]) -> None:
                 "leave one of them out"
             )
             findings.append(Finding("equal runs", run.name, len(run), text))
+
+
+def _check_unchanging(runs: Sequence[LogRun], findings: Sequence[Finding]) -> None:
+    """Raises ``DataError`` where runs left out for a signal have most of the rows.
+
+    A short one, as of a system that was switched on and did nothing, refuses no log.
+    """
+    left_out = [finding for finding in findings if finding.kind == UNCHANGING]
+    rows_left_out = sum(finding.count for finding in left_out)
+    if left_out and rows_left_out >= sum(map(len, runs)):
+        first = left_out[0]
+        raise DataError(f"few rows can be used: run {first.run} {first.text}")
 
 
 def _check_content(

@@ -11,7 +11,6 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from gpmpc._dynamics import Array
-from gpmpc.exceptions import DataError
 from gpmpc.logs._clocks import JUMP
 from gpmpc.logs._dropouts import changes_rarely, frozen_rows
 from gpmpc.logs._findings import RunFindings
@@ -26,6 +25,7 @@ USUAL_MOTION = 0.9  # quantile of the ranges within ``REST_TIME``
 # Share of the rows; beyond, a signal has another rate than its table. At half the rate
 # half of them repeat, or a little less where the two clocks drift: .45 is below both.
 MOST_HELD = 0.45
+UNCHANGING = "unchanging signal"  # kind of the finding of a run that is left out
 MOST_MISSING = 0.5  # of the rows within ``REST_TIME``: of fewer a range says nothing
 
 
@@ -67,10 +67,8 @@ def select_rows(
         findings: Of the run, which takes what is left out.
 
     Returns:
-        The run; None where less than two rows are left.
-
-    Raises:
-        DataError: A signal changes in so few rows that its sensor was silent, or slow.
+        The run; None where less than two rows are left, or where a signal changes in so
+        few rows that its sensor was silent, or slow.
     """
     values = mapping.split(table.values)
     rows = _RowSelection(len(table.time), findings)
@@ -81,7 +79,10 @@ def select_rows(
         rows.leave_out(at_rest, "at rest", text)
     is_missing = np.asarray(np.isnan(table.values).any(axis=1))
     rows.leave_out(is_missing, "missing value", "in a gap or without a value")
-    _leave_out_held_values(rows, table.name, values.states, mapping)
+    fault = _leave_out_held_values(rows, values.states, mapping)
+    if fault:
+        findings.add(UNCHANGING, len(table.time), f"is left out: {fault}")
+        return None
     motion = _ranges_of_rest_time(values.states, step) > rest_ranges
     _note_held_sensors(values.states, motion, mapping, findings)
     usable_rows = np.flatnonzero(rows.usable)
@@ -117,9 +118,12 @@ class _RowSelection:
 
 
 def _leave_out_held_values(
-    rows: _RowSelection, run: str, states: Array, mapping: LogMapping
-) -> None:
-    """Leaves out rows in which a whole signal of the states repeats the row before."""
+    rows: _RowSelection, states: Array, mapping: LogMapping
+) -> str:
+    """Leaves out rows in which a whole signal of the states repeats the row before.
+
+    Returns what is wrong where these are too many; empty otherwise.
+    """
     usable = rows.usable.copy()  # of all signals the same: they may repeat in turn
     count = usable.sum()
     for signal, columns in zip(
@@ -132,18 +136,19 @@ def _leave_out_held_values(
         repeats = (states[1:, columns] == states[:-1, columns]).all(axis=1)
         is_repeated = np.r_[False, repeats] & usable
         if is_repeated.sum() >= max(count - 1, 1):
-            raise DataError(
-                f"run {run}: {signal.name} never changes: its sensor was silent; "
-                "leave it out, or held: use"
+            return (
+                f"{signal.name} never changes: its sensor was silent; leave it out, or "
+                "held: use"
             )
         if is_repeated.sum() > MOST_HELD * max(count, 1):
             changes = (usable & ~is_repeated).sum()
-            raise DataError(
-                f"run {run}: {signal.name} changes in {changes} of {count} rows only: "
-                "its own rate is lower; state a lower rate, or held: use"
+            return (
+                f"{signal.name} changes in {changes} of {count} rows only: its own "
+                "rate is lower; state a lower rate, or held: use"
             )
         text = f"where {signal.name} repeats the row before"
         rows.leave_out(is_repeated, "held value", text)
+    return ""
 
 
 def _note_held_sensors(

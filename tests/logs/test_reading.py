@@ -355,6 +355,21 @@ def test_a_repeated_sample_of_a_moving_system_is_left_out(tmp_path):
         read_log(written(tmp_path, table), BODY)
 
 
+@pytest.mark.parametrize("rows", [10, 100])
+def test_a_run_in_which_a_signal_never_changes_is_left_out(tmp_path, rows):
+    still = body_table(rows)
+    still[["px", "py", "pz"]] = 0.5
+    moving = written(tmp_path, body_table(), "flight.csv")
+    idle = written(tmp_path, still, "idle.csv")
+    log = read_log([moving, idle], BODY)
+    assert [run.name for run in log] == ["flight"]
+    (finding,) = log.findings
+    assert (finding.run, finding.count) == ("idle", rows)
+    assert finding.text.startswith("is left out: position never changes: its sensor")
+    with pytest.raises(DataError, match="run idle is left out: position never changes"):
+        read_log(idle, BODY)
+
+
 def test_signals_that_repeat_in_turn_have_a_lower_rate(tmp_path):
     table = body_table()
     at_half_the_rate = np.arange(300) // 2 * 2
