@@ -10,7 +10,13 @@ import torch
 from gpmpc._arrays import is_measured
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, to_array
-from gpmpc.exceptions import DataError, SettingError, check_kind, check_method
+from gpmpc.exceptions import (
+    DataError,
+    SettingError,
+    ShapeError,
+    check_kind,
+    check_method,
+)
 from gpmpc.gaussian import Gaussian
 from gpmpc.learning._changed_model import ChangedModel
 from gpmpc.learning._settings import OnlineLearning
@@ -18,6 +24,7 @@ from gpmpc.learning._state import LearningState
 from gpmpc.learning._step import learn_from_step
 from gpmpc.mpc import Decision, Reference
 from gpmpc.mpc._controller import check_arguments
+from gpmpc.mpc._sqp import LINEAR_ALGEBRA_FAILURES
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.status import Status
 
@@ -30,7 +37,8 @@ class LearningController:
     flies any number of flights, and a flight begins where there is no decision before.
 
     Raises:
-        SettingError: The controller cannot change its model.
+        SettingError: The controller cannot change its model, or estimates a disturbance
+            beside: what both explain would be corrected twice.
         UnsupportedModel: No change of its model can be learned.
     """
 
@@ -39,6 +47,10 @@ class LearningController:
         if learning is None:
             learning = OnlineLearning()
         check_kind("learning", learning, OnlineLearning, "OnlineLearning(...)")
+        gain = controller.prediction.settings.disturbance_gain
+        if gain:
+            rule = "must be 0 beside online learning, which explains the same errors"
+            raise SettingError("disturbance_gain", f"{rule}; got {gain}")
         self.controller = controller
         self.learning = learning
         self.problem = controller.problem
@@ -64,7 +76,11 @@ class LearningController:
         check_arguments(belief, reference)
         if belief.names:
             belief = belief.in_order(self.signals.state_names)
-        learned = self._learn(to_array(belief.mean).copy(), previous)
+        measured = to_array(belief.mean).copy()
+        shape = (self.controller.prediction.state_dim,)
+        if measured.shape != shape:
+            raise ShapeError(f"state must have shape {shape}; got {measured.shape}")
+        learned = self._learn(measured, previous)
         controller = self._with_change(learned)
         options: dict[str, Any] = {}
         if parameters is not None:
@@ -79,7 +95,9 @@ class LearningController:
         if _has_failed(decision) and not is_as_measured:
             learning_time += decision.timing.total
             learned = learned.without_change()
+            programs = decision.iterations
             decision = self.controller.control(belief, reference, previous, **options)
+            decision = replace(decision, iterations=programs + decision.iterations)
         timing = replace(decision.timing, model=decision.timing.model + learning_time)
         return replace(decision, timing=timing, learned=learned)
 
@@ -108,6 +126,8 @@ class LearningController:
             return learned.after_gap(measured)
         try:
             return learn_from_step(learned, input, measured)
+        except LINEAR_ALGEBRA_FAILURES:  # where the model has a mean and no slope
+            return learned.after_gap(measured)
         except (SettingError, DataError):
             # The points contradict each other beyond double precision.
             return LearningState.begin(self._model, measured, learned.version + 1)

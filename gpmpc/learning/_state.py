@@ -47,12 +47,14 @@ class Expectation(NamedTuple):
         B = change.B_array
         latent = cast(Array, local.covariance)[0]
         noise = (B * step.noise_variance) @ B.T + np.diag(change.further_noise)
-        return Expectation(
-            mean=local.mean[0],
-            covariance=A @ self.covariance @ A.T + latent + noise,
-            by_input=A @ self.by_input + local.B[0],
-            by_change=A @ self.by_change + B,
-        )
+        # An infinite slope, times what is certain, is no number.
+        with np.errstate(invalid="ignore"):
+            return Expectation(
+                mean=local.mean[0],
+                covariance=A @ self.covariance @ A.T + latent + noise,
+                by_input=A @ self.by_input + local.B[0],
+                by_change=A @ self.by_change + B,
+            )
 
 
 class NewPlant(NamedTuple):

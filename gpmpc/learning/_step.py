@@ -68,7 +68,8 @@ def learn_from_step(
         # It is that of ``learning_state`` as well, and not None here.
         return _resolve_doubt(learning_state, step, comparison, before.doubt)
     innovation = comparison.planned(before.active)
-    surprising = innovation.largest_square > model.learning.surprise
+    # What is no number is surprising, too.
+    surprising = not innovation.largest_square <= model.learning.surprise
     if not surprising and not step.repeats.all():
         return _accept(learning_state, comparison)
     expected = learning_state.expect(Expectation.certain(before.state, model), step)
@@ -349,7 +350,7 @@ def _confirmed(
             variance=model.explainable_variance(expected.covariance),
         )
     explained = innovation.largest_square <= model.learning.surprise
-    if not explained or innovation.log_density <= density_to_beat:
+    if not (explained and innovation.log_density > density_to_beat):
         return None
     return plant._replace(
         model=model, expected=None, confirmations_left=plant.confirmations_left - 1

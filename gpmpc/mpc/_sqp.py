@@ -52,8 +52,9 @@ from gpmpc.status import Status
 Array = np.ndarray
 
 _TORCH_FAILURE = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
+LINEAR_ALGEBRA_FAILURES = (np.linalg.LinAlgError, _TORCH_FAILURE)
 # No finite numbers.
-FAILURES = (DataError, ProblemError, np.linalg.LinAlgError, _TORCH_FAILURE)
+FAILURES = (DataError, ProblemError, *LINEAR_ALGEBRA_FAILURES)
 _SUFFICIENT_DECREASE = 1e-4  # of what the program promised (Armijo)
 _STEP_LENGTHS = [2.0**-k for k in range(11)]
 # Share of the cost below which a difference says nothing: posteriors with

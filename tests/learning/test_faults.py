@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gpmpc.gaussian import Gaussian
+from gpmpc.gp import Trainer, Transitions
 from gpmpc.learning import (
     ChangedModel,
     LearningController,
@@ -14,7 +15,8 @@ from gpmpc.learning import (
     OnlineLearning,
     learn_from_step,
 )
-from gpmpc.mpc import GPMPC, ControlLoop, Reference
+from gpmpc.models import ResidualModel
+from gpmpc.mpc import GPMPC, Box, ControlLoop, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from tests.learning.test_online import MODEL, NOISE, PROBLEM, STEP, cart
@@ -381,10 +383,13 @@ def test_a_decision_that_fails_is_taken_without_the_change(monkeypatch):
 
     monkeypatch.setattr(plain, "with_model", lambda model: Failing())
     state = Gaussian.certain(before.means[1])
-    decision = controller.control(state, Reference(SINE[: HORIZON + 1]), before)
+    reference = Reference(SINE[: HORIZON + 1])
+    decision = controller.control(state, reference, before)
     assert decision.applicable
     assert not decision.learned.active
     assert decision.learned.size == len(MODEL)
+    alone = plain.control(state, reference, before)
+    assert decision.iterations == 2 * alone.iterations  # of both attempts
 
 
 @pytest.mark.parametrize("invalid", [1e200, np.finfo(float).max, np.inf])
@@ -399,6 +404,36 @@ def test_an_absurd_measurement_ends_no_flight(invalid):
     assert np.abs(errors[70:]).max() < 0.1
     assert decisions[-1].learned.doubt is None
     assert decisions[-1].learned.active
+
+
+def test_a_state_without_a_slope_ends_no_flight():
+    """Two wrong levels, one after the other; at the first the root has no slope."""
+    random = np.random.default_rng(0)
+
+    def tank(x, u):
+        return x + 0.1 * (u - torch.sqrt(x))
+
+    def filled(level, inflow):
+        return level + 0.1 * (inflow - np.sqrt(level)) + 0.01 * np.sin(3.0 * level)
+
+    levels = random.uniform(0.2, 2.0, (60, 1))
+    inflows = random.uniform(0.0, 2.0, (60, 1))
+    after = filled(levels, inflows) + random.normal(0.0, 0.002, (60, 1))
+    rows = Transitions(levels, inflows, after)
+    model = ResidualModel.train(tank, rows, trainer=Trainer(restarts=0))
+    problem = Problem(Tracking([1.0], [0.1]), Box([0.0], [2.0]))
+    loop = ControlLoop(
+        LearningController(GPMPC(model, Linearization(), problem, HORIZON, [1.0]))
+    )
+    level = np.ones(1)
+    for k in range(20):
+        wrong = {8: np.zeros(1), 9: np.full(1, 0.3)}
+        measured = wrong.get(k, level + random.normal(0.0, 0.002, 1))
+        level = filled(level, loop.input(measured, [1.0]))
+    assert loop.failures == 0
+    assert loop.last is not None
+    assert loop.last.plan is not None
+    assert loop.last.plan.learned.doubt is None
 
 
 def test_steps_without_a_measurement_count_as_time():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc.exceptions import SettingError, UnsupportedModel
+from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions
 from gpmpc.learning import (
@@ -20,7 +20,15 @@ from gpmpc.learning import (
 from gpmpc.learning._innovation import LearningStep
 from gpmpc.learning._state import Expectation
 from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc import GPMPC, Box, ControlLoop, Problem, Reference, Tracking
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    ControlLoop,
+    PredictionSettings,
+    Problem,
+    Reference,
+    Tracking,
+)
 from gpmpc.propagation import Linearization
 from gpmpc.testing import check_model
 
@@ -319,6 +327,19 @@ def test_what_cannot_be_learned_is_refused():
         OnlineLearning(memory=0.0)
     with pytest.raises(UnsupportedModel, match="in host memory; got object"):
         ChangedModel(object())
+    settings = PredictionSettings(disturbance_gain=0.3)
+    both = GPMPC(MODEL, Linearization(), PROBLEM, 8, [0.0], settings)
+    with pytest.raises(SettingError, match=r"disturbance_gain: must be 0 .*; got 0.3"):
+        LearningController(both)
+
+
+def test_a_state_of_another_length_is_refused_at_any_step():
+    steering = LearningController(GPMPC(MODEL, Linearization(), PROBLEM, 8, [0.0]))
+    origin = Reference(np.zeros(2))
+    last = steering.control(Gaussian.certain([0.0, 0.0]), origin)
+    for length in (1, 4):
+        with pytest.raises(ShapeError, match=r"state must have shape \(2,\)"):
+            steering.control(Gaussian.certain(np.zeros(length)), origin, last)
 
 
 def test_a_single_precision_model_is_changed_as_well():
