@@ -111,7 +111,7 @@ def unexplained_covariance(covariance: Tensor, H_root: Tensor) -> Tensor:
     remainder = torch.where(remainder.abs() <= round_off * sizes, 0.0, remainder)
     correlations = torch.where(sizes > 0, remainder / sizes, 0.0)
     projected, deficit = nearest_positive_semidefinite(correlations)
-    indefinite = deficit > round_off * len(deviations)
+    indefinite = deficit > round_off * deviations.shape[-1]
     return torch.where(indefinite[..., None, None], sizes * projected, remainder)
 
 

@@ -42,7 +42,7 @@ from scipy.stats import beta
 from torch import Tensor
 
 from gpmpc._angles import angles_of, full_turns, state_difference
-from gpmpc._arrays import read_array
+from gpmpc._arrays import is_measured, read_array
 from gpmpc._calls import explains_arguments
 from gpmpc._compiled import compiled
 from gpmpc._dynamics import Array, DynamicsModel, to_array
@@ -72,6 +72,7 @@ class ConformalTube:
 
     Raises:
         ShapeError: Scores or rows are no table of a row and a column.
+        DataError: A score or an entry of the rows is not finite.
         SettingError: An angle is no state.
 
     See Also:
@@ -85,6 +86,9 @@ class ConformalTube:
     def __post_init__(self) -> None:
         scores = np.sort(_table("scores", self.scores, "(N, H)"), axis=0)
         rows = _table("rows", self.rows, "(r, n)")
+        for name, table in (("scores", scores), ("rows", rows)):
+            if not np.isfinite(table).all():
+                raise DataError(f"{name} must be finite; got {table.tolist()}")
         check_indices("angles", self.angles, rows.shape[1])
         object.__setattr__(self, "scores", scores)
         object.__setattr__(self, "rows", rows)
@@ -261,17 +265,21 @@ class AdaptiveTube:
         self._step = 0
         # Plans count turns from the state that they began at, which a sensor may wrap.
         # So states and plans are moved by whole turns to where this state, the last
-        # one, goes on without jumps.
+        # value of each entry, goes on without jumps; NaN before the first.
         self._last_state = np.full(n, np.nan)
         self._compare(np.full(n, np.nan))  # nothing yet: kappas alone
 
     def observe(self, state: Any) -> Array:
         """Compares a state (n,) with the plans before it; returns kappas (H,).
 
+        Entries that are NaN, or of 1e30 or more in size, were not measured: a stage
+        where a direction of such an entry counts is not compared.
+
         Raises:
             ShapeError: It has another number of entries.
         """
         state = _of_shape("a state", state, (self.tube.rows.shape[1],))
+        state = np.where(is_measured(state), state, np.nan)
         state = self._without_jumps(state)
         self._step += 1
         self._compare(state)
@@ -318,8 +326,8 @@ class AdaptiveTube:
                 raise ShapeError(
                     f"stages must be ({H},) or {(H, r)}; got {counts.shape}"
                 )
-        if len(self.tube.angles) and np.isfinite(self._last_state).all():
-            means = means + full_turns(self._last_state - means[0], self.tube.angles)
+        turns = full_turns(self._last_state - means[0], self.tube.angles)
+        means = means + np.nan_to_num(turns)
         bounds = self._bounds[self._step % H]
         _remember.unchecked(
             means,
@@ -332,12 +340,13 @@ class AdaptiveTube:
         bounds[~counts] = np.nan
 
     def _without_jumps(self, state: Array) -> Array:
-        """Moves the angles of a state (n,) to within half a turn of the last ones."""
-        if not len(self.tube.angles) or not np.isfinite(state).all():
-            return state
-        if np.isfinite(self._last_state).all():
-            state = state - full_turns(state - self._last_state, self.tube.angles)
-        self._last_state = state
+        """Moves the angles of a state (n,) to within half a turn of the last ones.
+
+        NaN, which was not measured, stays; the last value of each entry counts.
+        """
+        turns = full_turns(state - self._last_state, self.tube.angles)
+        state = state - np.nan_to_num(turns)
+        self._last_state = np.where(np.isnan(state), self._last_state, state)
         return state
 
     @property

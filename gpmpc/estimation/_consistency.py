@@ -67,7 +67,8 @@ def normalized_errors(
 
     Raises:
         ShapeError: The two do not belong together.
-        SettingError: The level is not between 0 and 1, or no error is independent.
+        SettingError: The level is not between 0 and 1, or no error is independent, or
+            more than there are.
         DataError: No error is finite, or a covariance is not positive definite: the
             chi-square of such an error is not defined.
 
@@ -86,8 +87,8 @@ def normalized_errors(
         raise SettingError("level", f"must lie between 0 and 1; got {level}")
     if independent is not None:
         check_number("independent", independent, least=1, whole=True)
-    e = torch.as_tensor(errors, dtype=torch.float64)
-    P = torch.as_tensor(covariances, dtype=torch.float64)
+    e = _on_host(errors)
+    P = _on_host(covariances)
     n = e.shape[-1]
     if P.shape != (*e.shape, n):
         raise ShapeError(
@@ -117,6 +118,10 @@ def normalized_errors(
     values = whitened[..., 0].square().sum(-1).numpy()
     degrees = (~missing).sum(-1).numpy()
     count = len(values) if independent is None else independent
+    if count > len(values):
+        raise SettingError(
+            "independent", f"must be at most {len(values)}, the errors; got {count}"
+        )
     total = float(degrees.mean()) * count
     low, high = chi2.ppf([(1 - level) / 2, (1 + level) / 2], total) / total
     return Consistency(values=values, degrees=degrees, band=(float(low), float(high)))
@@ -136,7 +141,8 @@ def estimation_errors(belief: Gaussian, states: Any, angles: Any = ()) -> Tensor
     See Also:
         ``normalized_errors``.
     """
-    truth = torch.as_tensor(states, dtype=belief.mean.dtype)
+    mean = belief.mean
+    truth = torch.as_tensor(states, dtype=mean.dtype, device=mean.device)
     return state_difference(truth, belief.mean, angles)
 
 
@@ -172,8 +178,8 @@ def autocorrelation(
     See Also:
         ``normalized_errors``; ``FilterRun``, which has innovations.
     """
-    e = torch.as_tensor(innovations, dtype=torch.float64)
-    S = torch.as_tensor(covariances, dtype=torch.float64)
+    e = _on_host(innovations)
+    S = _on_host(covariances)
     if e.dim() != 2 or S.shape != (*e.shape, e.shape[1]):
         raise ShapeError(
             f"innovations (T, p) need covariances (T, p, p); got {tuple(e.shape)} and "
@@ -196,6 +202,11 @@ def autocorrelation(
     correlation = (a * b).sum() / scale
     limit = 1.96 / np.sqrt(len(a))
     return float(correlation), float(limit)
+
+
+def _on_host(values: Any) -> Tensor:
+    """Returns numbers as float64 on the CPU, without a graph."""
+    return torch.as_tensor(values, dtype=torch.float64).detach().cpu()
 
 
 def _whitened(errors: Tensor, covariances: Tensor) -> Tensor:

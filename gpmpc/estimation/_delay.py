@@ -10,8 +10,9 @@ delay tau the changes are regressed on the state and on the input tau steps earl
 and the delay with the largest correlation is the estimate: the maximum of the
 likelihood for Gaussian e. The state is part of the regression because in a closed loop
 the input depends on it. Errors e are correlated in time where the system is nonlinear;
-so the interval comes from resampling blocks of rows, not from the likelihood
-(moving-block bootstrap: Kuensch, 1989).
+so the interval comes from resampling blocks of rows that do not overlap (Carlstein,
+1986), not from the likelihood. The blocks are of one length, 2 N^(1/3) of N rows; up to
+a block less one row before the last is used by none, nor by the estimate.
 
 What the input of a delay changes can be told from what the state does by itself only
 where that input is no function of the state: one that is constant, that moves with
@@ -126,7 +127,7 @@ def estimate_delay(
     x = _without_jumps(x, angles)
     u = _standardized_inputs(u)
     state_basis = _orthonormal(x[rows])
-    changes = _independent_changes(np.diff(x, axis=0)[rows], state_basis)
+    changes = _independent_changes(x, rows, state_basis)
     delays = _delays(longest, resolution)
     grams = [
         _block_grams(state_basis, u, changes, rows, float(delay)) for delay in delays
@@ -166,17 +167,20 @@ def _delays(longest: int, resolution: float) -> Array:
     return np.round(delays, 9)
 
 
-def _independent_changes(changes: Array, state_basis: Array) -> Array:
+def _independent_changes(states: Array, rows: np.ndarray, state_basis: Array) -> Array:
     """The part of changes that the states do not explain, of unit square before.
 
     Args:
-        changes: Of the states in a step (rows, n).
+        states: All of the log (T + 1, n).
+        rows: Those whose change in a step counts.
         state_basis: Orthonormal columns of the states (rows, r).
 
     Raises:
         DataError: No state moves, but at a constant pace.
     """
-    moving = np.ptp(changes, axis=0) > 0
+    changes = np.diff(states, axis=0)[rows]
+    round_off = 1e-14 * np.abs(states).max(axis=0)
+    moving = np.ptp(changes, axis=0) > round_off
     if not moving.any():
         raise DataError(
             "no state moves, but at a constant pace: the data cannot tell the delay of "
@@ -266,11 +270,15 @@ def _check_different(inputs: Array) -> None:
 
 
 def _acting_inputs(inputs: Array, rows: np.ndarray, delay: float) -> Array:
-    """Returns the inputs (rows, m) that act in each row with a delay [steps]."""
-    whole = int(np.ceil(delay))
-    weight = delay - (whole - 1)  # of the older input
-    newer = inputs[rows - max(whole - 1, 0)]
-    return weight * inputs[rows - whole] + (1 - weight) * newer
+    """Returns the inputs (rows, m) that act in each row with a delay [steps].
+
+    They lie between those of the two whole delays around it; without a delay both are
+    the row's own.
+    """
+    older = int(np.ceil(delay))
+    newer = max(older - 1, 0)
+    weight = delay - newer  # of the older input
+    return weight * inputs[rows - older] + (1 - weight) * inputs[rows - newer]
 
 
 def _independent_inputs(state_basis: Array, acting: Array, delay: float) -> Array:

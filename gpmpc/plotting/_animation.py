@@ -54,7 +54,7 @@ def animate(run: "Run", path: str | Path) -> None:
         path: The file, .gif or .mp4 (which needs ffmpeg).
 
     Raises:
-        SettingError: An MP4 is asked for, and there is no ffmpeg.
+        SettingError: Another ending, or an MP4 where there is no ffmpeg.
         DataError: The recording has no step.
         UnsupportedModel: The recording has no position in space.
     """
@@ -67,8 +67,11 @@ def animate(run: "Run", path: str | Path) -> None:
 
 
 def check_file(path: str | Path) -> None:
-    """Raises ``SettingError`` where an MP4 is asked for, and there is no ffmpeg."""
-    if Path(path).suffix == ".mp4" and not FFMpegWriter.isAvailable():
+    """Raises ``SettingError`` unless it is a GIF, or an MP4 and there is ffmpeg."""
+    ending = Path(path).suffix
+    if ending not in (".gif", ".mp4"):
+        raise SettingError("path", f"must end in .gif or .mp4; got {path}")
+    if ending == ".mp4" and not FFMpegWriter.isAvailable():
         raise SettingError("path", f"an MP4 needs ffmpeg, a GIF does not; got {path}")
 
 

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from gpmpc._calls import explains_arguments
-from gpmpc.exceptions import check_kind
+from gpmpc.exceptions import SettingError, check_kind
 from gpmpc.plotting._style import (
     BLUE,
     COLOURS,
@@ -138,17 +138,28 @@ def innovations_figure(
 ) -> Figure:
     """Draws the innovations of each measured value over their standard deviation.
 
-    The legend says how many are outside of 95 %.
+    The legend says how many are outside of 95 %, and how many were not measured. One of
+    a value that was known exactly beforehand has no deviation, and is not drawn.
+
+    Raises:
+        SettingError: The names are not one a measured value.
     """
     from gpmpc.estimation import FilterRun
 
     check_kind("run", run, FilterRun, "what KalmanFilter.run returns")
     stds = run.innovation_covariances.diagonal(dim1=-2, dim2=-1).sqrt()
-    normalized = (run.innovations / stds).cpu().numpy()
+    innovations = run.innovations.detach().cpu().numpy()
+    deviations = stds.detach().cpu().numpy()
+    is_drawn = np.isfinite(innovations) & (deviations > 0)
+    normalized = np.full_like(innovations, np.nan)
+    np.divide(innovations, deviations, out=normalized, where=is_drawn)
+    missing = 1 - np.isfinite(innovations).mean(axis=0)
     p = normalized.shape[1]
     times = time_step * np.arange(len(normalized))
     if names is None:
         names = [f"y{i + 1}" for i in range(p)]
+    if len(names) != p:
+        raise SettingError("names", f"must be {p}, one a measured value; got {names}")
     figure, axes = make_figure(
         width=7.0,
         height=1.0 + 1.4 * p,
@@ -157,22 +168,26 @@ def innovations_figure(
         sharex=True,
     )
     for i, axis in enumerate(axes.flat):
-        _draw_innovations(axis, times, normalized[:, i])
+        _draw_innovations(axis, times, normalized[:, i], missing[i])
         axis.set_ylabel(figure_label(names[i]))
     axes[-1, 0].set_xlabel("time [s]")
     return figure
 
 
-def _draw_innovations(axis: Axes, times: np.ndarray, normalized: np.ndarray) -> None:
-    """Draws one value's innovations (K,), NaN where it was not measured."""
-    is_measured = np.isfinite(normalized)
-    measured = normalized[is_measured]
-    missing = 100 * float((~is_measured).mean())
+def _draw_innovations(
+    axis: Axes, times: np.ndarray, normalized: np.ndarray, missing: float
+) -> None:
+    """Draws one value's innovations (K,), NaN where there is nothing to draw.
+
+    ``missing`` is the share that was not measured.
+    """
+    is_drawn = np.isfinite(normalized)
+    drawn = normalized[is_drawn]
     outside = np.nan
-    if len(measured):
-        outside = 100 * float((np.abs(measured) > _NORMAL_95).mean())
-    label = f"{outside:.1f} % outside (5 % expected), {missing:.0f} % missing"
-    axis.plot(times[is_measured], measured, ".", color=BLUE, markersize=3, label=label)
+    if len(drawn):
+        outside = 100 * float((np.abs(drawn) > _NORMAL_95).mean())
+    label = f"{outside:.1f} % outside (5 % expected), {100 * missing:.0f} % missing"
+    axis.plot(times[is_drawn], drawn, ".", color=BLUE, markersize=3, label=label)
     for limit in (-_NORMAL_95, _NORMAL_95):
         axis.axhline(limit, color=VERMILION, linewidth=0.8)
     axis.legend(loc="upper right", fontsize="small")
@@ -254,7 +269,10 @@ def _draw_intervals(axis: Axes, judgement: "Judgement", group: int) -> None:
 @explains_arguments
 @styled
 def inspection_figure(inspection: "Inspection") -> Figure:
-    """Draws each channel over the time, with its gaps, on one page."""
+    """Draws each channel over the time, with its gaps, on one page.
+
+    Of more than 24 the first are drawn, which the title says.
+    """
     from gpmpc.logs import Inspection
 
     check_kind("inspection", inspection, Inspection, "what inspect_log returns")
@@ -279,7 +297,10 @@ def inspection_figure(inspection: "Inspection") -> Figure:
         axis.set_xlabel("row" if over_rows else "time [s]")
     for axis in axes.T.flat[len(channels) :]:
         axis.set_visible(False)
-    figure.suptitle(figure_label(inspection.title), fontsize=10)
+    title = inspection.title
+    if len(inspection.lines) > len(channels):
+        title += f" (the first {len(channels)} of {len(inspection.lines)} channels)"
+    figure.suptitle(figure_label(title), fontsize=10)
     return figure
 
 

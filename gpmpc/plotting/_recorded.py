@@ -66,10 +66,14 @@ def expected(run: "Run", states: list[int]) -> tuple[np.ndarray, np.ndarray]:
 def _unplanned_noise(run: "Run") -> np.ndarray:
     """Returns standard deviations (n,) of the noise that the plans leave out."""
     n = len(run.state_names)
-    deviations = run.metadata.get("run", {}).get("noise_std", "").split()
-    if len(deviations) != n:
+    words = run.metadata.get("run", {}).get("noise_std", "").split()
+    try:
+        deviations = np.array(words, dtype=float)
+    except ValueError:  # metadata of others
         return np.zeros(n)
-    return np.array(deviations, dtype=float)
+    if len(deviations) != n or not np.isfinite(deviations).all():
+        return np.zeros(n)
+    return deviations
 
 
 class _Tracked(NamedTuple):

@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gpmpc._angles import wrap
+from gpmpc._arrays import is_measured
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import to_array
 from gpmpc.exceptions import Diverged, ShapeError, check_method, check_number
@@ -289,7 +290,7 @@ class _CascadeFlight:
     ) -> Reference:
         """Returns what the inner controller is to follow under an outer command."""
         angles = measured[6::2]
-        if np.isfinite(angles).all():
+        if is_measured(angles).all():
             self._angles = angles
         # Its first input belongs to the outer step under way, after a failure as well.
         planned = thrust.input[None]

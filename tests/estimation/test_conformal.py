@@ -172,6 +172,25 @@ def test_a_state_that_is_not_measured_hides_no_bound_on_another():
     assert (tube.counts.tolist(), tube.misses.tolist()) == ([1], [1])
 
 
+@pytest.mark.parametrize("unmeasured", [np.nan, np.inf, 3.4e38])
+def test_an_angle_goes_on_without_jumps_beside_what_is_not_measured(unmeasured):
+    scores = np.linspace(0.1, 3, 100)[:, None]
+    both_sides = [[1.0, 0.0], [-1.0, 0.0]]
+    tube = AdaptiveTube(ConformalTube(scores, both_sides, angles=[0]), 0.9)
+    plan = np.array([[3.10, 0.0], [3.15, 0.0]])
+    covariances = np.tile(0.05**2 * np.eye(2), (2, 1, 1))
+    tube.observe([unmeasured, unmeasured])
+    tube.observe([3.10, 0.0])
+    tube.remember(plan, covariances)
+    tube.observe([3.153 - 2 * np.pi, unmeasured])  # beyond the sensor's turn
+    assert (tube.counts.tolist(), tube.misses.tolist()) == ([1], [0])
+    tube.remember(plan, covariances)
+    tube.observe([unmeasured, 0.0])
+    tube.remember(plan, covariances)
+    tube.observe([2.0, unmeasured])
+    assert (tube.counts.tolist(), tube.misses.tolist()) == ([2], [1])
+
+
 def test_plans_compare_at_their_stage_without_failed_steps():
     tube = AdaptiveTube(ConformalTube(np.ones((19, 3)), [[1.0]]), 0.9, largest=5.0)
     covariances = np.ones((4, 1, 1))
@@ -201,6 +220,8 @@ def test_misuse_is_refused():
         ShapeError, match=r"must be one log; got \(41, 2\) and \(30, 2\)"
     ):
         ConformalTube.calibrate(MODEL, PROPAGATOR, x, u[:30], H)
+    with pytest.raises(DataError, match="scores must be finite; got"):
+        ConformalTube([[1.0], [np.nan]], [[1.0]])
     tube = ConformalTube.calibrate(MODEL, PROPAGATOR, x, u, H)
     with pytest.raises(
         SettingError, match="probability: must lie between 0 and 1; got 1"

@@ -126,6 +126,7 @@ OTHER = np.random.default_rng(3).normal(size=(300, 1))
             "input 3 is a sum of those before",
         ),
         (lambda x, u: (0 * x + 1, u), "no state moves"),
+        (lambda x, u: (0.1 * np.arange(len(x))[:, None], u), "no state moves"),
         (
             lambda x, u: (x, np.eye(300, 1, -3)),  # one pulse, near the beginning
             "input 1 of 0 steps before is constant in the rows",

@@ -18,6 +18,7 @@ from gpmpc.estimation import (
     normalized_errors,
     smooth,
 )
+from gpmpc.estimation._conditioning import unexplained_covariance
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import DelayedModel, DisturbedModel
@@ -521,6 +522,39 @@ def test_errors_of_the_wrong_size_are_inconsistent():
     assert normalized_errors(errors, P).degrees.sum() == 596
 
 
+@pytest.mark.parametrize(
+    "device",
+    [
+        "cpu",
+        pytest.param(
+            "cuda",
+            marks=pytest.mark.skipif(
+                not torch.cuda.is_available(), reason="needs CUDA"
+            ),
+        ),
+    ],
+)
+def test_errors_of_a_graph_or_a_gpu_are_judged_as_their_numbers(device):
+    numbers = torch.from_numpy(np.random.default_rng(0).normal(size=(50, 2)))
+    covariances = torch.eye(2, dtype=F, device=device).expand(50, 2, 2)
+    errors = numbers.to(device, copy=True).requires_grad_()
+    expected = normalized_errors(numbers, covariances.cpu())
+    assert normalized_errors(errors, covariances).mean == expected.mean
+    white = autocorrelation(numbers, covariances.cpu())
+    assert autocorrelation(errors, covariances) == white
+    belief = Gaussian(errors.detach(), covariances)
+    assert torch.equal(estimation_errors(belief, numbers.numpy()).cpu(), 0 * numbers)
+
+
+def test_a_batch_of_one_is_projected_as_its_member():
+    eps = torch.finfo(F).eps
+    covariance = torch.tensor([[1.0, 1 + 24 * eps], [1 + 24 * eps, 1.0]], dtype=F)
+    shown = torch.zeros(2, 2, dtype=F)
+    alone = unexplained_covariance(covariance, shown)
+    in_batch = unexplained_covariance(covariance[None], shown[None])
+    assert torch.equal(in_batch[0], alone)
+
+
 def test_white_innovations_of_correlated_sensors_are_white():
     S = np.array([[1.0, 0.95, 0.0], [0.95, 1.0, 0.0], [0.0, 0.0, 0.0]])
     S[2, :2] = S[:2, 2] = 0.4
@@ -664,6 +698,11 @@ def test_white_innovations_of_correlated_sensors_are_white():
             "independent: must be a whole number",
         ),
         (
+            lambda m: normalized_errors([[1.0]], [[[1.0]]], independent=2),
+            SettingError,
+            "independent: must be at most 1, the errors; got 2",
+        ),
+        (
             lambda m: autocorrelation(np.zeros((5, 1)), np.ones((5, 1, 1))),
             DataError,
             "not all zero",
@@ -693,6 +732,11 @@ def test_the_figure_shows_measured_innovations_and_those_outside():
     white = run.innovations[:, 0] / run.innovation_covariances[:, 0, 0].sqrt()
     assert np.allclose(points[0], white)
     assert "10 % missing" in axes[1].lines[0].get_label()
+    with pytest.raises(SettingError, match="names: must be 2, one a measured value"):
+        innovations_figure(run, names=["a"])
+    run.innovation_covariances[:6] = 0.0  # known exactly beforehand
+    label = innovations_figure(run).axes[0].lines[0].get_label()
+    assert ", 0 % missing" in label
 
 
 def test_labels_that_two_sensors_share_are_taken_as_they_stand():

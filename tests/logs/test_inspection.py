@@ -137,6 +137,14 @@ def test_a_broken_log_is_inspected_all_the_same(table, tmp_path, name):
     assert len(png(inspection_figure(inspection), dpi=30)) > 500
 
 
+def test_the_page_of_many_channels_says_how_many_it_draws(tmp_path):
+    values = np.random.default_rng(0).normal(size=(200, 30))
+    table = pandas.DataFrame(values, columns=[f"c{i}" for i in range(30)])
+    table.to_csv(tmp_path / "log.csv", index=False)
+    figure = inspection_figure(inspect_log(tmp_path / "log.csv"))
+    assert "the first 24 of 30 channels" in figure.get_suptitle()
+
+
 def test_a_broken_log_becomes_a_page_too(tmp_path):
     (tmp_path / "log.csv").write_text("t\n0.0\n0.1\n")
     result = forked("log", "inspect", "log.csv", cwd=tmp_path)

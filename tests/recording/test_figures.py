@@ -14,6 +14,7 @@ from gpmpc.cli._plot import plot
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import animate, inputs_figure, timing_figure, tracking_figure
 from gpmpc.plotting._animation import FFMpegWriter, draw_flight
+from gpmpc.plotting._recorded import expected
 from gpmpc.recording import McapRecorder, RecordedSystem, read_run
 from tests.recording.runs import record_run
 
@@ -108,6 +109,14 @@ def test_a_film_as_mp4_needs_ffmpeg(run, tmp_path, monkeypatch):
     with pytest.raises(SettingError, match="an MP4 needs ffmpeg"):
         animate(run, tmp_path / "flight.mp4")
     assert not (tmp_path / "flight.mp4").exists()
+    with pytest.raises(SettingError, match=r"path: must end in \.gif or \.mp4; got"):
+        animate(run, tmp_path / "flight.MOV")
+
+
+def test_a_noise_that_is_no_numbers_widens_no_band(run):
+    words = " ".join("abcdef")
+    hostile = replace(run, metadata=run.metadata | {"run": {"noise_std": words}})
+    np.testing.assert_array_equal(expected(hostile, [0, 1]), expected(run, [0, 1]))
 
 
 def killed(picture, file=None, **settings):

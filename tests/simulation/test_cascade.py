@@ -153,6 +153,13 @@ def test_without_any_measurement_for_a_moment_both_plans_go_on():
     assert [k for k, _ in flight.inner.failures] == [40, 41]
     assert np.isfinite(flight.inner.references).all()
     assert distance(flight) < 0.5
+
+    class Marking(Dropout):
+        def disturb_measurement(self, state, time):
+            return np.nan_to_num(super().disturb_measurement(state, time), nan=3.4e38)
+
+    marked = fly(Elliptical(), 5, disturbances=[Marking(2.0, 2.1)], on_failure="hold")
+    assert np.array_equal(marked.inner.references, flight.inner.references)
     with pytest.raises(SolverFailure, match="step 2: the state is not finite"):
         fly(Elliptical(), 5, disturbances=[Dropout(2.0, 2.1)])
 
