@@ -289,6 +289,7 @@ class LogMapping:
             check_choice("time.unit", self.time_unit, tuple(TIME_UNITS))
         if not self.of("states"):
             raise SettingError("states", "must name at least one signal; got none")
+        self._check_repeated_columns()
         self._check_topics()
 
     def _check_time(self) -> None:
@@ -318,6 +319,26 @@ class LogMapping:
                     raise SettingError(
                         f"runs.{run}.{name}", "is no column that the mapping uses"
                     )
+
+    def _check_repeated_columns(self) -> None:
+        """Raises ``SettingError`` where a column of the states is used once more.
+
+        A rollout is given the inputs to come: with a state among them it would be
+        given what it predicts.
+        """
+        for meanings in ({}, *self.runs.values()):
+            signals: dict[tuple[str, str], Signal] = {}  # by topic and column
+            for signal in (*self.of("states"), *self.of("inputs")):
+                for column in signal.columns:
+                    key = (signal.topic, meanings.get(column, column))
+                    first = signals.setdefault(key, signal)
+                    is_new = first is signal and signal.columns.count(column) == 1
+                    if first.role == "states" and not is_new:
+                        raise SettingError(
+                            f"{signal.role}.{signal.name}.columns",
+                            f"must have none of states.{first.name} again; got "
+                            f"{key[1]!r}",
+                        )
 
     def _check_topics(self) -> None:
         topics = {signal.topic for signal in self.signals}

@@ -26,6 +26,7 @@ from gpmpc.logs._time_step import find_time_step
 from gpmpc.logs._usable_rows import UNCHANGING, least_motion, select_rows
 
 MOST_UNLIKE_SPREAD = 30.0  # of two entries of one signal
+LARGEST_ROUNDING = 1e-4  # of an input that is a state in other units
 
 
 @explains_arguments
@@ -81,6 +82,7 @@ def read_log(
     _check_unchanging(runs, findings)
     _check_content(runs, paths, findings)
     _note_unlike_entries(runs, mapping, findings)
+    _note_copied_states(runs, mapping, findings)
     _note_equal_runs(runs, findings)
     if mapping.model == "rigid_body":
         runs, remarks = read_rigid_bodies(runs, step, mapping)
@@ -235,6 +237,35 @@ def _note_unlike_entries(
             "hardly counts; name a signal for each quantity"
         )
         findings.append(Finding("unlike entries", runs[0].name, len(states), text))
+
+
+def _note_copied_states(
+    runs: Sequence[LogRun], mapping: LogMapping, findings: list[Finding]
+) -> None:
+    """Notes inputs that are a state in other units: a rollout is given what it seeks.
+
+    So is the output of a feedback without noise of one state alone.
+    """
+    states = np.concatenate([run.states for run in runs])
+    inputs = np.concatenate([run.inputs for run in runs])
+    states = states - states.mean(axis=0)
+    inputs = inputs - inputs.mean(axis=0)
+    state_names = mapping.column_names("states")
+    input_names = mapping.column_names("inputs")
+    for name, column in zip(input_names, inputs.T, strict=True):
+        for state_name, state in zip(state_names, states.T, strict=True):
+            if not state.any() or not column.any():
+                continue
+            factor = (state @ column) / (state @ state)
+            remainder = np.abs(column - factor * state).max()
+            if remainder > LARGEST_ROUNDING * np.abs(column).max():
+                continue
+            text = (
+                f"{name} is {state_name} times {factor:.4g}, plus a constant: "
+                "predictions that are given the inputs to come are given this state; "
+                "is it the right column?"
+            )
+            findings.append(Finding("copied state", runs[0].name, len(column), text))
 
 
 def _note_equal_runs(runs: Sequence[LogRun], findings: list[Finding]) -> None:

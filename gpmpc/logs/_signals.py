@@ -128,6 +128,7 @@ def read_signal(
         return _unit_quaternions(where, values, signal, findings, is_kept)
     kept_values = np.where(is_kept[:, None], values, np.nan)
     _check_angles(where, kept_values, signal, findings, follows)
+    _note_turns(values, signal, findings, follows)
     if signal.kind == "euler":
         return _euler_to_quaternions(values, present=~absent)
     return values
@@ -175,6 +176,23 @@ def _check_angles(
         raise DataError(f"{where}: {text}")
     count = int((np.abs(values) > LARGEST_ANGLE).any(axis=1).sum())
     findings.add("large angle", count, f"{text} or does it count turns? left in")
+
+
+def _note_turns(
+    values: Array, signal: Signal, findings: RunFindings, follows: np.ndarray
+) -> None:
+    """Notes angles of inputs and context that jump by a turn: they are plain numbers.
+
+    Models take the sine and the cosine of angles of states alone.
+    """
+    if signal.kind != "angle" or signal.role == "states":
+        return
+    jumps = np.abs(np.diff(values, axis=0)[follows[1:]]) > np.pi
+    text = (
+        f"{signal.name} jumps by a turn {jumps.sum()} times, and is no state: models "
+        "take it as a plain number; log its sine and cosine, or count its turns"
+    )
+    findings.add("turns", jumps.sum(), text)
 
 
 def _count_jumps(changes: Array) -> int:

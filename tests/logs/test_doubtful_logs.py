@@ -4,8 +4,8 @@ import numpy as np
 import pandas
 import pytest
 
-from gpmpc.exceptions import DataError
-from gpmpc.logs import inspect_log, read_log
+from gpmpc.exceptions import DataError, SettingError
+from gpmpc.logs import LogMapping, inspect_log, read_log
 
 MAPPING = {"time": "t", "states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
 
@@ -308,3 +308,43 @@ def test_an_input_that_is_held_from_row_to_row_is_taken_as_it_is(tmp_path):
     log = read_log(written(tmp_path, table), {**MAPPING, "rate": 50})
     np.testing.assert_array_equal(log.runs[0].inputs[:, 0], table["u"][::20])
     assert not log.findings
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"inputs": {"u": ["x"]}},
+        {"states": {"x": ["x", "x"]}},
+        {"states": {"x": ["x"], "y": ["x"]}},
+        {"runs": {"a": {"x": "y1", "u": "y1"}}},
+    ],
+)
+def test_a_column_of_the_states_is_used_once(change):
+    with pytest.raises(SettingError, match="must have none of states.x again; got "):
+        LogMapping.from_dict({**MAPPING, **change})
+
+
+def test_an_input_may_come_twice_with_other_delays():
+    inputs = {"u": ["u"], "late": {"columns": ["u"], "delay": -0.2}}
+    assert len(LogMapping.from_dict({**MAPPING, "inputs": inputs}).of("inputs")) == 2
+
+
+def test_an_input_that_is_a_state_in_other_units_is_noted(tmp_path):
+    table = table_of()
+    table["u"] = np.round(100 * table["x"] + 40, 2)
+    log = read_log(written(tmp_path, table), MAPPING)
+    (text,) = texts(log, "copied state")
+    assert text.startswith("u is x times 100, plus a constant: predictions that are")
+    table["u"] += np.cos(np.arange(300))
+    assert not read_log(written(tmp_path, table), MAPPING).findings
+
+
+@pytest.mark.parametrize("role", ["inputs", "context"])
+def test_an_angle_that_is_no_state_and_jumps_by_a_turn_is_noted(tmp_path, role):
+    table = table_of()
+    table["heading"] = np.mod(10.0 * np.arange(300), 360)
+    heading = {"columns": ["heading"], "kind": "angle", "unit": "deg"}
+    signals = {**MAPPING.get(role, {}), "heading": heading}
+    log = read_log(written(tmp_path, table), {**MAPPING, role: signals})
+    (text,) = texts(log, "turns")
+    assert text.startswith("heading jumps by a turn 8 times, and is no state: models")
