@@ -67,9 +67,8 @@ class RunState(Enum):
     RUNNING = "running"
     FINISHED = "finished"
     FAILED = "failed"
-    #: begun, and neither ended nor in anybody's hands: its process was killed. (A
-    #: flight that is "lost" is something else: it was flown to its end, and judged.)
-    ABANDONED = "lost"
+    #: begun, and neither ended nor in anybody's hands: its process was killed
+    ABANDONED = "abandoned"
 
 
 @dataclass(frozen=True)

@@ -74,7 +74,7 @@ class SweepStatus:
             RunState.FINISHED: "finished",
             RunState.FAILED: "failed",
             RunState.RUNNING: "running",
-            RunState.ABANDONED: "begun and left",
+            RunState.ABANDONED: "abandoned",
             RunState.NOT_BEGUN: "to fly",
         }
         counts = [

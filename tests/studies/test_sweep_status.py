@@ -58,7 +58,7 @@ def test_runs_are_counted_by_their_state(tree):
     assert status.rate == pytest.approx(3 / 40, rel=0.05)
     assert status.seconds_left == pytest.approx(5 / status.rate)
     assert status.line() == (
-        "12 runs: 4 finished, 3 failed, 1 running, 1 begun and left, 3 to fly; "
+        "12 runs: 4 finished, 3 failed, 1 running, 1 abandoned, 3 to fly; "
         f"{60 * status.rate:.3g} a minute, 0:01:07 left; "
         "2 failed: size must be at most 25; got 98; 1 failed: x"
     )
