@@ -257,21 +257,30 @@ class _Split(NamedTuple):
 def _split(log: Log, held_out: Sequence[str]) -> _Split:
     """Splits a log into the runs to learn from and those to judge on.
 
-    Where nobody chose, a fifth of the runs is held out, of all lengths: the middle ones
-    of as many groups. Of one run it is the last fifth, or what is left of the rows that
-    learning needs.
+    Where nobody chose, a fifth of the runs is held out, of all lengths on which a model
+    can be judged: the middle ones of as many groups. Where there is but one of these,
+    it is the last fifth of it, or what is left of the rows that learning needs.
     """
     if held_out:
         return _Split(*log.split([*held_out]))
-    names = [run.name for run in sorted(log.runs, key=len)]
-    if len(names) == 1:
-        (run,) = log.runs
+    runs = sorted(log.runs, key=len)
+    names = [run.name for run in runs if _longest_piece(run) >= PAST + 2]
+    if len(names) < 2:
+        run = max(runs, key=_longest_piece)
         rows = max(round(0.8 * len(run)), min(fewest_rows(1), len(run) - 2))
-        return _Split(*log.split_by_time(rows / len(run)), run)
+        share = min(rows, len(run) - 1) / len(run)
+        first, last = replace(log, runs=(run,)).split_by_time(share)
+        others = [other for other in log.runs if other is not run]
+        return _Split(replace(first, runs=(*others, *first.runs)), last, run)
     count = max(len(names) // 5, 1)
     groups = np.array_split(names, count)
     middle = [str(group[(len(group) - 1) // 2]) for group in groups]
     return _Split(*log.split(middle))
+
+
+def _longest_piece(run: LogRun) -> int:
+    """Returns the number of rows of a run's longest piece."""
+    return max(end - begin for begin, end in run.pieces)
 
 
 class _StageResults(dict[str, Any]):

@@ -277,7 +277,10 @@ def check_train(train: Log) -> None:
     longest = train.longest_piece
     if longest < needed:
         remedies = ["log longer runs", "resample over gaps (rate and max_gap)"]
-        if any(finding.kind == "at rest" for finding in train.findings):
+        kinds = {finding.kind for finding in train.findings}
+        if "held value" in kinds:
+            remedies.append("keep values that repeat (held: use)")
+        if "at rest" in kinds:
             remedies.append("keep what is at rest (rest: use)")
         raise DataError(
             f"learning needs {needed} rows without a gap; the longest piece to learn "

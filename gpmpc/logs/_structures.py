@@ -290,7 +290,7 @@ def _multirotor_base(log: Log, most_rows_back: int) -> Structure:
     nominal = MultirotorNominal(
         motors=len(log.input_names),
         voltage=_median_voltage(log),
-        thrusts=all(signal.unit == "N" for signal in log.mapping.of("inputs")),
+        thrusts=all(signal.group.unit == "N" for signal in log.mapping.of("inputs")),
     )
     model = LogModel(
         kinematics=RigidBodyKinematics(log.space),

@@ -299,13 +299,17 @@ def run_of(rows, name="run"):
         ([40, 300, 200, 250, 100], [200]),
         ([300, 40], [40]),
         ([*range(30, 41)], [32, 38]),
+        ([-25, -22, 300, 40], [40]),
+        ([-25, -22, 300], [36]),  # the last fifth of it
+        ([-28], [-29]),
     ],
 )
 def test_runs_of_middle_length_are_held_out_by_default(lengths, held_out):
     runs = tuple(run_of(rows + 30, f"{rows}") for rows in lengths)
     mapping = LogMapping.from_dict({"states": {"x": ["x"]}, "inputs": {"u": ["u"]}})
-    judged = _split(Log(mapping, 0.1, runs), []).held_out(20)
-    assert sorted(len(run) - 30 for run in judged) == held_out
+    split = _split(Log(mapping, 0.1, runs), [])
+    assert sorted(len(run) - 30 for run in split.held_out_rows) == held_out
+    assert len(split.train) + len(split.held_out_rows) == sum(map(len, runs))
 
 
 def test_outcomes_are_of_the_times_and_pieces_of_the_rows():

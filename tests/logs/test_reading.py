@@ -11,7 +11,10 @@ from scipy.spatial.transform import Rotation
 from gpmpc._angles import wrap
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.logs import LogMapping, inspect_log, read_log
+from gpmpc.logs._judging import check_train
 from gpmpc.logs._runs import split_into_runs
+from gpmpc.logs._structures import _multirotor_base
+from gpmpc.models._parametric import MultirotorNominal
 from gpmpc.models._quaternions import rotate, rotation_quaternion
 from gpmpc.models._state_space import StateGroup, StateSpace
 
@@ -353,6 +356,28 @@ def test_a_repeated_sample_of_a_moving_system_is_left_out(tmp_path):
     )
     with pytest.raises(DataError, match=r"position changes in \d+ of 300 rows only"):
         read_log(written(tmp_path, table), BODY)
+
+
+def test_repeated_values_that_cut_a_log_are_named_with_a_way_out(tmp_path):
+    table = body_table()
+    position = table[["px", "py", "pz"]].round(2)
+    position[1::10] = position[::10].to_numpy()  # of a coarse sensor
+    table[["px", "py", "pz"]] = position
+    log = read_log(written(tmp_path, table), BODY)
+    with pytest.raises(DataError, match=r"keep values that repeat \(held: use\)$"):
+        check_train(log)
+
+
+@pytest.mark.parametrize(
+    ("unit", "thrusts"), [("mN", True), ("kN", True), ("V", False)]
+)
+def test_inputs_in_any_unit_of_force_are_thrusts(tmp_path, unit, thrusts):
+    table = body_table().assign(a=1, b=2, c=3)
+    motors = {"columns": ["u", "a", "b", "c"], "unit": unit}
+    log = read_log(written(tmp_path, table), {**BODY, "inputs": {"motors": motors}})
+    nominal = _multirotor_base(log, 0).model.nominal
+    assert isinstance(nominal, MultirotorNominal)
+    assert nominal.thrusts == thrusts
 
 
 @pytest.mark.parametrize("rows", [10, 100])
