@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from gpmpc._angles import state_difference
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
-from gpmpc.learning._changed_model import ChangedModel, Comparison
+from gpmpc.learning._changed_model import ChangedModel, Comparison, ObservedChange
 from gpmpc.learning._innovation import LARGEST_LEAD, Innovation, LearningStep
 from gpmpc.learning._state import Doubt, Expectation, LearningState, NewPlant
 
@@ -49,7 +49,9 @@ def learn_from_step(
     measured = np.array(measured, dtype=float)
     observed = model.observe(before.state, input, measured)
     if not (np.abs(observed.value) < _ABSURD * np.sqrt(model.gp_noise)).all():
-        return before.after_gap(measured)
+        if before.doubt is None:
+            return before.after_gap(measured)
+        return _resolve_outside_model(before, before.doubt, input, measured, observed)
     noise_ratios = _with_noise_ratio(before, observed.value)
     learning_state = before.with_measurement(measured, observed.value, noise_ratios)
     if len(noise_ratios) < _FEWEST_RATIOS:
@@ -66,7 +68,12 @@ def learn_from_step(
     comparison = model.predict_then_learn(step)
     if before.doubt is not None:
         # It is that of ``learning_state`` as well, and not None here.
-        return _resolve_doubt(learning_state, step, comparison, before.doubt)
+        try:
+            return _resolve_doubt(learning_state, step, comparison, before.doubt)
+        except np.linalg.LinAlgError:  # the model has a mean there, and no slope
+            return _resolve_outside_model(
+                before, before.doubt, input, measured, observed
+            )
     innovation = comparison.planned(before.active)
     # What is no number is surprising, too.
     surprising = not innovation.largest_square <= model.learning.surprise
@@ -323,6 +330,51 @@ def _resolve_doubt(
     return _put_in_doubt(
         seen, step, comparison, expected_if_wrong, doubt.trusted_noise_ratios
     )
+
+
+def _resolve_outside_model(
+    before: LearningState,
+    doubt: Doubt,
+    input: Array,
+    measured: Array,
+    observed: ObservedChange,
+) -> LearningState:
+    """Takes the measurement in doubt, where the model has no number, for wrong.
+
+    So the one after it (n,) has to follow from the state before the doubt.
+    """
+    model = before.model
+    unknown = np.full_like(before.observed_change, np.nan)
+    seen = before.with_measurement(measured, unknown, before.noise_ratios)
+    step = LearningStep(
+        state=before.state,
+        input=input,
+        next_state=measured,
+        point=observed.point,
+        observed_change=unknown,
+        latent_variance=observed.latent_variance,
+        noise_variance=_noise_variance(doubt.trusted_noise_ratios, model),
+    )
+    expected = seen.expect(doubt.expected, step)
+    innovation = seen.innovation(expected)
+    if innovation.largest_square <= model.learning.surprise:
+        return seen.without_doubt(doubt).later()
+    steps_in_doubt = doubt.steps_in_doubt + 1
+    bridged = steps_in_doubt <= _LONGEST_BRIDGE and not _acts_like_input(
+        innovation=innovation,
+        by_input=model.B_inverse @ expected.by_input,
+        notable=_NOTABLE,
+        deviations=_DEVIATIONS,
+    )
+    still = Doubt(
+        expected=expected,
+        trusted_noise_ratios=doubt.trusted_noise_ratios,
+        new_plants=(),
+        steps_in_doubt=steps_in_doubt,
+        bridged=bridged,
+    )
+    unexplained_steps = min(seen.unexplained_steps + 1, _PATIENCE)
+    return replace(seen, doubt=still, unexplained_steps=unexplained_steps).later()
 
 
 def _confirmed(

@@ -406,8 +406,9 @@ def test_an_absurd_measurement_ends_no_flight(invalid):
     assert decisions[-1].learned.active
 
 
-def test_a_state_without_a_slope_ends_no_flight():
-    """Two wrong levels, one after the other; at the first the root has no slope."""
+@pytest.mark.parametrize(("first", "second"), [(0.0, 0.3), (-0.1, 5.0), (0.1, 5.0)])
+def test_two_wrong_levels_are_bridged_whatever_the_model_knows_there(first, second):
+    """At none the root has no slope, and below no number."""
     random = np.random.default_rng(0)
 
     def tank(x, u):
@@ -427,9 +428,10 @@ def test_a_state_without_a_slope_ends_no_flight():
     )
     level = np.ones(1)
     for k in range(20):
-        wrong = {8: np.zeros(1), 9: np.full(1, 0.3)}
+        wrong = {8: np.full(1, first), 9: np.full(1, second)}
         measured = wrong.get(k, level + random.normal(0.0, 0.002, 1))
         level = filled(level, loop.input(measured, [1.0]))
+        assert abs(level - 1.0) < 0.02
     assert loop.failures == 0
     assert loop.last is not None
     assert loop.last.plan is not None
