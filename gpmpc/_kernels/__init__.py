@@ -30,9 +30,9 @@ from gpmpc._kernels._gp_point import (
     kernel_rows,
     linearize_points,
 )
-from gpmpc._kernels._packed import Array, GPArrays, Packed, pack
+from gpmpc._kernels._packed import Array, GPArrays, Packed, as_doubles, pack
 from gpmpc._kernels._window import Window
-from gpmpc.exceptions import ShapeError
+from gpmpc.exceptions import SettingError, ShapeError
 
 __all__ = [
     "Expansion",
@@ -103,8 +103,13 @@ def linearize_gps(
         adds_state: Whether the GPs predict differences x+ - x (k = n).
 
     Raises:
-        ShapeError: x or u do not fit.
+        ShapeError: x, u or the prior means do not fit, or the GPs of differences are
+            not one a state.
+        SettingError: A window has no points, or a row of its factor is missing.
     """
+    x = as_doubles(x)
+    u = as_doubles(u)
+    offset = as_doubles(offset)
     H = len(x)
     k = len(packed.arrays.weights)
     n = packed.state_dim
@@ -114,10 +119,20 @@ def linearize_gps(
             f"the model takes states (H, {n}) and inputs (H, {m}); got {x.shape} and "
             f"{u.shape}"
         )
-    if (
-        covariance and H > _POINTS_AT_ONCE
-    ):  # a row of kernels for each would fill memory
-        parts = [
+    if offset.shape != (k,) or (adds_state and k != n):
+        raise ShapeError(
+            f"{k} GPs have as many prior means, and states where they predict "
+            f"differences; got {offset.shape} and {n} states"
+        )
+    if isinstance(packed, Window) and not 0 < packed.arrays.size == packed.rows:
+        raise SettingError(
+            "packed",
+            f"has {packed.rows} of the {packed.arrays.size} rows of its factor: append "
+            "points until all are there",
+        )
+    # a row of kernels for each would fill memory
+    if covariance and H > _POINTS_AT_ONCE:
+        blocks = [
             linearize_gps(
                 packed,
                 x=x[first : first + _POINTS_AT_ONCE],
@@ -128,11 +143,11 @@ def linearize_gps(
             )
             for first in range(0, H, _POINTS_AT_ONCE)
         ]
-        covariances = [part.covariance for part in parts]
+        covariances = [block.covariance for block in blocks]
         return LinearizedGPs(
-            mean=np.concatenate([part.mean for part in parts]),
-            A=np.concatenate([part.A for part in parts]),
-            B=np.concatenate([part.B for part in parts]),
+            mean=np.concatenate([block.mean for block in blocks]),
+            A=np.concatenate([block.A for block in blocks]),
+            B=np.concatenate([block.B for block in blocks]),
             covariance=np.concatenate([V for V in covariances if V is not None]),
         )
     padded = packed.arrays.points.shape[1]
@@ -150,10 +165,10 @@ def linearize_gps(
     linearize_points.unchecked(
         gp=packed.arrays,
         columns=columns,
-        prior_mean=np.ascontiguousarray(offset, dtype=np.float64),
+        prior_mean=offset,
         adds_state=adds_state,
-        x=np.ascontiguousarray(x, dtype=np.float64),
-        u=np.ascontiguousarray(u, dtype=np.float64),
+        x=x,
+        u=u,
         memory=memory,
         out=linearized,
     )

@@ -126,7 +126,8 @@ def pack(
         features: The points x~ (N, n + m).
         lengthscales: l (k, n + m).
         signal_variance: sf2 (k,).
-        cholesky: Lower factor L of K + sn2 I (k, N, N), which is kept and not copied.
+        cholesky: Lower factor L of K + sn2 I (k, N, N), which is kept and not copied
+            if it is float64.
         weights: beta = (K + sn2 I)^-1 y (k, N).
         state_dim: n.
 
@@ -154,14 +155,22 @@ def pack(
     padded_weights[:, :size] = weights
     arrays = GPArrays(
         points=points,
-        inverse_squares=np.ascontiguousarray(lengthscales**-2.0),
-        log_signal=np.log(signal_variance),
+        inverse_squares=as_doubles(lengthscales) ** -2.0,
+        log_signal=np.log(as_doubles(signal_variance)),
         weights=padded_weights,
         size=size,
     )
     return Packed(
-        arrays=arrays, cholesky=cholesky, state_dim=state_dim, input_dim=d - state_dim
+        arrays=arrays,
+        cholesky=np.asarray(cholesky, dtype=np.float64),
+        state_dim=state_dim,
+        input_dim=d - state_dim,
     )
+
+
+def as_doubles(values: Array) -> Array:
+    """Returns numbers as kernels take them for granted: contiguous float64."""
+    return np.ascontiguousarray(values, dtype=np.float64)
 
 
 def aligned(shape: tuple[int, int]) -> Array:

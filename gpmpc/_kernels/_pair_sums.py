@@ -70,7 +70,7 @@ def sum_pairs(pair, weights_i, weights_j, z_a, z_b, E, size, same, derivatives):
     """Writes the sums of ``pair``, from its other terms; returns sum_ij P_ij.
 
     ``E`` is read for a = b (``same``). Sums p_i and g are written only with
-    ``derivatives``; without, p_i is of no meaning.
+    ``derivatives``; without, p_i is of no meaning, also where it is multiplied below.
     """
     for d in range(len(z_a)):
         multiply_entries(weights_i, z_a[d], pair.weighted_z[d])

@@ -22,7 +22,7 @@ import numpy as np
 
 from gpmpc._compiled import compiled, njit_noalloc
 from gpmpc._kernels._gp_point import write_kernel
-from gpmpc._kernels._packed import COLUMNS, Array, GPArrays, aligned
+from gpmpc._kernels._packed import COLUMNS, Array, GPArrays, aligned, as_doubles
 from gpmpc._kernels._simd import load, store, use_widest_registers
 from gpmpc._kernels.linalg import aligned_rows, four_dots
 from gpmpc.exceptions import DataError, SettingError, ShapeError
@@ -51,7 +51,8 @@ class Window:
     input_dim: int  #: m
     rows: int = 0  #: number of rows of L that are computed: N > 0 where the GPs predict
     #: whether a next window may write to ``columns``: one item, which the first takes;
-    #: a list, since to take from it is one step also where threads share the window
+    #: a list, since to take from it is one step also where threads share the window. It
+    #: is not given back where that append fails: the next one copies
     _extension_token: list[None] = field(default_factory=lambda: [None])
 
     @classmethod
@@ -66,8 +67,8 @@ class Window:
         data = np.zeros((d + 3 * k, 0))
         arrays = GPArrays(
             points=data[:d],
-            inverse_squares=np.ascontiguousarray(lengthscales**-2.0),
-            log_signal=np.log(signal_variance),
+            inverse_squares=as_doubles(lengthscales) ** -2.0,
+            log_signal=np.log(as_doubles(signal_variance)),
             weights=data[:k],  # of the shape alone, as N = 0
             size=0,
         )
@@ -311,12 +312,12 @@ def drop_point(columns, gone, after):
                 row[j:gone] = columns[a, j, j:gone]
                 row[gone:] = columns[a, j, gone + 1 :]
                 continue
-            old = columns[a, j + 1]
-            radius = np.hypot(old[j + 1], below[j])
-            c = old[j + 1] / radius
+            old_column = columns[a, j + 1]
+            radius = np.hypot(old_column[j + 1], below[j])
+            c = old_column[j + 1] / radius
             s = below[j] / radius
             for i in range(j, size):
-                entry = old[i + 1]
-                other = below[i]
-                row[i] = c * entry + s * other
-                below[i] = c * other - s * entry
+                entry = old_column[i + 1]
+                absorbed = below[i]
+                row[i] = c * entry + s * absorbed
+                below[i] = c * absorbed - s * entry

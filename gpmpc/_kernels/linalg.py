@@ -155,21 +155,21 @@ def add_product(A, B, out):
         row = out[i]
         for k in range(len(B)):
             factor = A[i, k]
-            other = B[k]
+            B_row = B[k]
             for j in range(len(row)):
-                row[j] += factor * other[j]
+                row[j] += factor * B_row[j]
 
 
 @njit_noalloc
 def add_transposed_product(A, B, out):
     """Adds A' B."""
     for k in range(len(B)):
-        other = B[k]
+        B_row = B[k]
         for i in range(len(out)):
             factor = A[k, i]
             row = out[i]
             for j in range(len(row)):
-                row[j] += factor * other[j]
+                row[j] += factor * B_row[j]
 
 
 @njit_noalloc

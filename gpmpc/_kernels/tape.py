@@ -127,7 +127,7 @@ def run_tape(tape, z, work, value, tangents):
         operation = tape.code[k, 0]
         i = 8 * tape.code[k, 1]
         j = 8 * tape.code[k, 2]
-        last = 8 * tape.code[k, 3]
+        second = 8 * tape.code[k, 3]
         if operation == OUTPUT:
             store(value, i, load(work, j))
             if tangents is not None:
@@ -148,7 +148,7 @@ def run_tape(tape, z, work, value, tangents):
                     store(tangents.places, i * d + c, zeros() + slope)
         else:
             result, by_first, by_second = _operate(
-                operation, load(work, j), load(work, last), work, 8 * tape.places
+                operation, load(work, j), load(work, second), work, 8 * tape.places
             )
             store(work, i, result)
             if tangents is not None:
@@ -156,8 +156,8 @@ def run_tape(tape, z, work, value, tangents):
                 for c in range(0, 8 * d, 8):
                     tangent = by_first * load(tangents.places, j * d + c)
                     if both:
-                        second = load(tangents.places, last * d + c)
-                        tangent = tangent + by_second * second
+                        second_tangent = load(tangents.places, second * d + c)
+                        tangent = tangent + by_second * second_tangent
                     store(tangents.places, i * d + c, tangent)
 
 

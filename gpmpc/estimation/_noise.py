@@ -277,15 +277,15 @@ def _residuals_within(
     """
     n = model.model.state_dim
     Z, W, L, M = tensors_for(model, *model.linear_part)
-    left = next_states - states @ L.mT - inputs @ M.mT
+    unexplained = next_states - states @ L.mT - inputs @ M.mT
     inner = _residuals_of(
         model.model,
         states=states[:, :n],
         inputs=states @ Z.mT + inputs @ W.mT,
-        next_states=left[:, :n],
+        next_states=unexplained[:, :n],
         block=block,
     )
-    further = left[:, n:]
+    further = unexplained[:, n:]
     return Residuals(
         errors=torch.cat([inner.errors, further], dim=1),
         latent=torch.cat([inner.latent, torch.zeros_like(further)], dim=1),
@@ -457,9 +457,8 @@ def estimate_varying_noise(
             f"got {len(errors)} rows"
         )
     squares = errors.square().clamp_min(1e-300)
-    seen, inputs = noise_features(model)(transitions.states, transitions.inputs)
-    states = seen.cpu()
-    inputs = inputs.cpu()
+    features = noise_features(model)(transitions.states, transitions.inputs)
+    states, inputs = (part.cpu() for part in features)
     learner = _VarianceLearner.start(states, inputs, squares, latent, seed)
     fold = torch.arange(len(squares)) // block % FOLDS
     gains = torch.zeros_like(errors)

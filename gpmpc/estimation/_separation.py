@@ -165,8 +165,8 @@ def _with_noise(model: GPPosterior | ResidualModel, process: Tensor) -> Any:
     learned = (B.square() @ gp.noise_variance).clamp_min(smallest)
     # Of each output the largest part that a state it acts on has left; all of one that
     # acts on none.
-    left = process.to(learned) / learned
-    left_by_output = torch.where(B != 0, left[:, None], 0.0).amax(dim=0)
-    parts = torch.where((B != 0).any(dim=0), left_by_output, 1.0)
-    quieter = replace(gp, noise_variance=parts * gp.noise_variance)
+    fraction = process.to(learned) / learned
+    largest_fraction = torch.where(B != 0, fraction[:, None], 0.0).amax(dim=0)
+    fraction_of_output = torch.where((B != 0).any(dim=0), largest_fraction, 1.0)
+    quieter = replace(gp, noise_variance=fraction_of_output * gp.noise_variance)
     return replace(model, residual=quieter)

@@ -162,13 +162,16 @@ def check_pointwise(model: Any) -> None:
     """Raises ``UnsupportedModel`` where a point's prior depends on other points."""
     points = training_points(model)[..., :_PROBES, :]
     with torch.no_grad():
-        alone = model.forward(points[..., :3, :])
-        among = model.forward(points)
-    count = alone.mean.shape[-1]
-    covariance = among.covariance_matrix[..., :count, :count]
+        prior_of_three = model.forward(points[..., :3, :])
+        prior = model.forward(points)
+    mean = prior_of_three.mean
+    count = mean.shape[-1]
+    covariance = prior.covariance_matrix[..., :count, :count]
     differences = [
-        _difference(among.mean[..., :count], alone.mean, among.mean.std() + 1),
-        _difference(covariance, alone.covariance_matrix, covariance.abs().max()),
+        _difference(prior.mean[..., :count], mean, prior.mean.std() + 1),
+        _difference(
+            covariance, prior_of_three.covariance_matrix, covariance.abs().max()
+        ),
     ]
     if not max(differences) <= _SAME:
         raise UnsupportedModel(
@@ -191,7 +194,11 @@ def _probes(model: Any) -> Tensor:
     width = torch.where(upper > lower, upper - lower, 1.0)
     generator = torch.Generator().manual_seed(0)
     unit = torch.rand(
-        _PROBES, inputs.shape[-1], generator=generator, dtype=torch.float64
+        _PROBES,
+        inputs.shape[-1],
+        generator=generator,
+        dtype=torch.float64,
+        device="cpu",  # the generator's
     )
     around = lower[..., None, :] + (2 * unit.to(inputs) - 0.5) * width[..., None, :]
     return torch.cat([among, around], dim=-2)

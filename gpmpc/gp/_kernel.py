@@ -56,8 +56,9 @@ IGNORED = 1e8
 # points: from here on kernel matrices are made and factorised one after another, in
 # place
 _MANY = 1000
-_ROWS = 64  # of such a matrix at a time: they fit the cache
-_FEW = 16  # columns of a kernel matrix whose differences, all at once, fit the cache
+_ROWS_AT_ONCE = 64  # of such a matrix: they fit the cache
+# of a kernel matrix whose differences, all at once, fit the cache
+_COLUMNS_AT_ONCE = 16
 
 
 def kernel_of_squares(squares: Tensor, signal_variance: Tensor) -> Tensor:
@@ -79,7 +80,7 @@ def kernel_matrix(
         lengthscales: (k, d).
         signal_variance: (k,).
     """
-    if len(others) <= _FEW:
+    if len(others) <= _COLUMNS_AT_ONCE:
         squares = (points[:, None] - others).square() @ lengthscales.mT**-2  # (N, M, k)
         squares = squares.movedim(-1, 0)
         return kernel_of_squares(squares, signal_variance[:, None, None])
@@ -159,8 +160,10 @@ def _factorize_in_place(
     # Columns are contiguous, as LAPACK wants them.
     cholesky = features.new_empty(outputs, size, size).mT
     for a, factor in enumerate(cholesky):
-        for end in range(_ROWS, size + _ROWS, _ROWS):  # the lower triangle
-            rows = slice(end - _ROWS, end)
+        for end in range(
+            _ROWS_AT_ONCE, size + _ROWS_AT_ONCE, _ROWS_AT_ONCE
+        ):  # the lower triangle
+            rows = slice(end - _ROWS_AT_ONCE, end)
             columns = slice(0, end)
             factor[rows, columns] = kernel_matrix(
                 features[rows],

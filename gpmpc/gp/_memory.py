@@ -87,5 +87,5 @@ def _left_in_group(folder: Path) -> int:
     statistics = (folder / "memory.stat").read_text().splitlines()
     pages = dict(line.split() for line in statistics)
     droppable = int(pages.get("inactive_file", 0))
-    used = int((folder / "memory.current").read_text()) - droppable
-    return int((folder / "memory.max").read_text()) - used
+    occupied = int((folder / "memory.current").read_text()) - droppable
+    return int((folder / "memory.max").read_text()) - occupied

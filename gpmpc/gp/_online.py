@@ -104,7 +104,7 @@ def append_points(
     signal_variance = posterior.signal_variance
     lengthscales = posterior.lengthscales
     cross = kernel_matrix(posterior.features, features, lengthscales, signal_variance)
-    corner = kernel_matrix(features, features, lengthscales, signal_variance)
+    kernel = kernel_matrix(features, features, lengthscales, signal_variance)
 
     # One pass over the factor serves the new rows and the weights.
     old_residuals = (posterior.targets - posterior.offset).mT[..., None]  # (k, N, 1)
@@ -112,12 +112,12 @@ def append_points(
     whitened = torch.linalg.solve_triangular(posterior.cholesky, columns, upper=False)
     L21 = whitened[..., :p].mT
     whitened_old = whitened[..., p:]  # L^-1 (y - offset)
-    corner = corner - L21 @ L21.mT
+    schur_complement = kernel - L21 @ L21.mT
     noise = posterior.observation_noise
     if noise is None:  # new rows are observations, also beside pseudo-observations
         noise = posterior.noise_variance
-    corner.diagonal(dim1=-2, dim2=-1).add_(noise[:, None])
-    L22, info = torch.linalg.cholesky_ex(corner)
+    schur_complement.diagonal(dim1=-2, dim2=-1).add_(noise[:, None])
+    L22, info = torch.linalg.cholesky_ex(schur_complement)
     check_positive_definite(info, signal_variance, noise)
     cholesky = posterior.cholesky.new_empty(posterior.output_dim, size + p, size + p)
     cholesky[:, :size, :size] = posterior.cholesky
@@ -290,16 +290,16 @@ class SlidingWindow:
         self, posterior: GPPosterior, features: Tensor, targets: Tensor
     ) -> GPPosterior:
         """Appends points x~ (p, n + m) with targets (p, k), and removes others."""
-        larger = append_points(posterior, features, targets)
+        extended = append_points(posterior, features, targets)
         candidates = len(posterior)
         if len(features) <= self.points:
-            return self._reduce(larger, candidates)
+            return self._reduce(extended, candidates)
         _log.warning(
             "%d new points exceed the window of %d: some are removed too",
             len(features),
             self.points,
         )
-        new_alone = remove_points(larger, range(candidates))
+        new_alone = remove_points(extended, range(candidates))
         return self._reduce(new_alone, candidates=len(features))
 
     def _reduce(self, posterior: GPPosterior, candidates: int) -> GPPosterior:

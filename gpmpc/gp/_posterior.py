@@ -27,7 +27,7 @@ from gpmpc._dynamics import (
     tensors_for,
     to_array,
 )
-from gpmpc.exceptions import UnsupportedModel
+from gpmpc.exceptions import ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian, check_tensors, constant_arrays
 from gpmpc.gp._backend import check_and_choose_compiled
 from gpmpc.gp._kernel import factorize, kernel_of_squares
@@ -173,7 +173,17 @@ class GPPosterior(TensorModel):
         Args:
             features: The scaling of x~ (n + m,).
             targets: The scaling of the targets (k,).
+
+        Raises:
+            ShapeError: A scaling is of another number of columns.
         """
+        columns = (features.factor.shape[0], targets.factor.shape[0])
+        expected = (self.features.shape[1], self.output_dim)
+        if columns != expected:
+            raise ShapeError(
+                f"scalings must be of {expected[0]} features and {expected[1]} "
+                f"targets; got {columns[0]} and {columns[1]}"
+            )
         observation_noise = self.observation_noise
         if observation_noise is not None:
             observation_noise = observation_noise * targets.factor**2

@@ -190,10 +190,10 @@ class OutputSearch:
         self._deadline = deadline
         self._constant = features.constant
         self._log_constant_lengthscales = np.log(_prior_lengthscales(features))
-        self._log_box_centre = np.log(_search_lengthscales(features))
+        self._log_lengthscales = np.log(_search_lengthscales(features))
         self._log_output = np.log(output_std(targets))
         self._box = search_box(
-            self._log_box_centre, self._log_output, settings.signal_to_noise_limit
+            self._log_lengthscales, self._log_output, settings.signal_to_noise_limit
         )
         # Of the points of the present search; ``_use_points`` sets both.
         self._likelihood: NegativeLogMarginalLikelihood
@@ -247,7 +247,7 @@ class OutputSearch:
         deviations of the features: among the data the output is known, far from them it
         is not. A single row leaves the noise open as well: that of the plain start.
         """
-        log_lengthscales = self._log_box_centre + np.log(_SMOOTH)
+        log_lengthscales = self._log_lengthscales + np.log(_SMOOTH)
         log_lengthscales[self._constant] = self._log_constant_lengthscales[
             self._constant
         ]
@@ -268,9 +268,9 @@ class OutputSearch:
     ) -> list[np.ndarray]:
         """The points where the exploration begins."""
         plain = np.append(
-            self._log_box_centre, [self._log_output, np.log(_PLAIN_RATIO)]
+            self._log_lengthscales, [self._log_output, np.log(_PLAIN_RATIO)]
         )
-        longer = np.append(np.full(len(self._log_box_centre), _LONGER), [0.0, 0.0])
+        longer = np.append(np.full(len(self._log_lengthscales), _LONGER), [0.0, 0.0])
         starts = [plain if first is None else first]
         starts += [plain + longer + shift for shift in perturbations]
         return starts
@@ -322,7 +322,7 @@ class OutputSearch:
         with np.errstate(over="ignore", invalid="ignore"):
             value, gradient = self._likelihood(theta)
             if self._settings.penalty is not None:
-                penalty, slope = self._settings.penalty(theta, self._log_box_centre)
+                penalty, slope = self._settings.penalty(theta, self._log_lengthscales)
                 value = value + penalty
                 gradient = gradient + slope
         self.evaluations += 1

@@ -44,7 +44,9 @@ from gpmpc.gp._posterior import GPPosterior
 from gpmpc.gp._tensor_checks import Predicts, check_gp_tensors
 
 Method = Literal["sgpr", "fitc"]
-JITTER = 1e-8  # of Kzz, in units of sf2
+# of Kzz, in units of sf2: ``SparseTrainer`` adds it always, ``sparse_posterior`` by
+# default only where Kzz has no factor without
+JITTER = 1e-8
 _ENTRIES = 200_000  # of a block of A
 # directions in which the data inform less than this (b) get a pseudo-noise of 1 / this
 _UNINFORMED = 1e-10

@@ -149,7 +149,8 @@ class SparseTrainer:
         )
         check_sparse_memory(len(data), data.targets.shape[1], self.inducing)
         # A stationary kernel depends on differences; those from one of the points are
-        # exact, wherever the data lie.
+        # exact, wherever the data lie, which those from ``data.feature_scaling``'s
+        # mean are not.
         scaling = Scaling(data.features[0], data.feature_scaling.factor)
         x = scaling.scale(data.features)
         y = data.scaled_targets

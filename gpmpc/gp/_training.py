@@ -299,12 +299,12 @@ class Trainer:
         check_memory(size, k)
         features = _search_features(data)
         targets = data.scaled_targets.numpy()
-        first = self._first_starts(data, features, start)
+        start_thetas = self._start_thetas(data, features, start)
         rng = np.random.default_rng(seed)
         # The first start needs none. Its row is drawn and not used: without it a seed
         # would mean other starts than it always did.
         perturbations = rng.normal(size=(k, self.restarts + 1, d + 2))
-        rows = self._first_rows(size, rng, has_start=start is not None)
+        subset_rows = self._subset_rows(size, rng, has_start=start is not None)
 
         results: list[SearchResult] = []
         evaluations = 0
@@ -319,8 +319,8 @@ class Trainer:
             with threadpool_limits(1 if size < _ONE_THREAD else None, user_api="blas"):
                 deviation = _deviation_of_constant(data, a)
                 if deviation is None:
-                    first_rows = _with_moving_rows(rows, targets[:, a])
-                    results.append(search(first[a], perturbations[a, 1:], first_rows))
+                    rows = _with_moving_rows(subset_rows, targets[:, a])
+                    results.append(search(start_thetas[a], perturbations[a, 1:], rows))
                 else:
                     results.append(search.result_of_constant(deviation))
             evaluations += search.evaluations
@@ -353,7 +353,7 @@ class Trainer:
             seconds=time.perf_counter() - start_time,
         )
 
-    def _first_starts(
+    def _start_thetas(
         self, data: TrainingData, features: SearchFeatures, start: GPPosterior | None
     ) -> list[np.ndarray | None]:
         """The first start (d + 2,) of every output; None for the plain one.
@@ -382,7 +382,7 @@ class Trainer:
             )
         ]
 
-    def _first_rows(
+    def _subset_rows(
         self, size: int, rng: np.random.Generator, has_start: bool
     ) -> np.ndarray | slice:
         """The rows that are searched first."""

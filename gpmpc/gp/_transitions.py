@@ -433,13 +433,13 @@ def _check_places(labels: Sequence[str], names: Sequence[str]) -> None:
     """
 
     def named(label: str) -> str:
-        words = [rf"(?<![^\W_]){re.escape(name)}(?![^\W_])" for name in names]
-        held = [
+        patterns = [rf"(?<![^\W_]){re.escape(name)}(?![^\W_])" for name in names]
+        named_states = [
             name
-            for name, word in zip(names, words, strict=True)
-            if re.search(word, label)
+            for name, pattern in zip(names, patterns, strict=True)
+            if re.search(pattern, label)
         ]
-        return max(held, key=len, default="")
+        return max(named_states, key=len, default="")
 
     order = [named(label) for label in labels]
     if sorted(order) == sorted(names) and order != list(names):

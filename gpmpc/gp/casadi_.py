@@ -175,7 +175,7 @@ def _predict_gps(gp: GPPosterior, x: casadi.MX, u: casadi.MX) -> _Prediction:
     mean = casadi.sum1(k * _numbers(gp.weights.mT)).T + _numbers(gp.offset)
     variances = []
     lower = casadi.Sparsity.lower(size)
-    eye = torch.eye(size, dtype=torch.float64)
+    eye = torch.eye(size, dtype=torch.float64, device="cpu")
     for a, column in enumerate(casadi.horzsplit(k)):
         # The factor's inverse, since CasADi cannot serialise its triangular solve; both
         # lose the same digits.
@@ -275,7 +275,7 @@ def _run_tape(
     value: dict[int, casadi.SX] = {}
     try:
         for row, constant in zip(rows, constants, strict=True):
-            operation, target, first, last = row
+            operation, target, first, second = row
             if operation == tapes.OUTPUT:
                 value[target] = work[first]
             elif operation == tapes.INPUT:
@@ -283,7 +283,7 @@ def _run_tape(
             elif operation == tapes.CONST:
                 work[target] = casadi.SX(constant)
             elif operation in tapes.TWO_OPERANDS:
-                work[target] = casadi.SX.binary(operation, work[first], work[last])
+                work[target] = casadi.SX.binary(operation, work[first], work[second])
             elif operation in tapes.OPERATIONS:
                 work[target] = casadi.SX.unary(operation, work[first])
             else:
@@ -322,7 +322,7 @@ def jacobian_of(function: casadi.Function) -> casadi.Function:
     is_tape = function.is_a("SXFunction")
     arguments: list[Any] = function.sx_in() if is_tape else function.mx_in()
     value = casadi.vec(function(*arguments))
-    parts = [casadi.jacobian(value, argument) for argument in arguments]
+    jacobians = [casadi.jacobian(value, argument) for argument in arguments]
     return casadi.Function(
-        f"{function.name()}_jacobian", arguments, [casadi.horzcat(*parts)]
+        f"{function.name()}_jacobian", arguments, [casadi.horzcat(*jacobians)]
     )

@@ -89,9 +89,9 @@ class LearningController:
             options["plan"] = plan
         learning_time = perf_counter() - start
 
-        known = _belief(learned, belief)
-        decision = controller.control(known, reference, previous, **options)
-        is_as_measured = learned.planning is None and known is belief
+        planned_belief = _belief(learned, belief)
+        decision = controller.control(planned_belief, reference, previous, **options)
+        is_as_measured = learned.planning is None and planned_belief is belief
         if _has_failed(decision) and not is_as_measured:
             learning_time += decision.timing.total
             learned = learned.without_change()

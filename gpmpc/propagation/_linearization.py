@@ -171,6 +171,7 @@ class MeanEquivalence(NoisyPropagator):
         input = checked_arguments(model, belief, input)
         certain = Gaussian(belief.mean, torch.zeros_like(belief.covariance))
         linearization = Linearization(self.process_noise)
+        linearization.diagonal = self.diagonal
         result = linearization.differentiate(model, certain, input)
         if result is None:
             return None

@@ -154,7 +154,7 @@ def _extended_derivatives(
     n = root.shape[-1]
     p = n + n**2
     # dSigma = E S + S E for a change E of the root S: a derivative D by Sigma becomes
-    # 2 D S
+    # 2 D S, since D is symmetric, and so is every E that occurs
     twice = 2 * root[..., None, :, :]
     mean_by_root = to_array(sensitivity.mean_by_covariance) @ twice
     by_root = to_array(sensitivity.covariance_by_covariance) @ twice[..., None, :, :]

@@ -258,9 +258,11 @@ def _derivatives(
     by_input = _with_transpose(form.B, AS, _extend(df.dJ_du, form.inputs, m))
     by_covariance = _with_transpose(form.B, AS, dJ_dS.flatten(-2))
     by_covariance = by_covariance.unflatten(-1, dJ_dS.shape[-2:])
-    # ... and, together with A S A', with S: A S (A + B J)' + B J S A', at one J
-    outer = torch.einsum("ic,...jd->...ijcd", A, A + BJ)
-    outer = outer + torch.einsum("...ic,jd->...ijcd", BJ, A)
+    # ... and, together with A S A', with S: of A S (A + B J)' + B J S A' the derivative
+    # while J stays; A and A + B J stand on both sides of dS
+    by_inner_covariance = torch.einsum("ic,...jd->...ijcd", A, A + BJ) + torch.einsum(
+        "...ic,jd->...ijcd", BJ, A
+    )
     return Sensitivity(
         mean_by_mean=A + BJ,
         mean_by_covariance=residual.mean_by_covariance,
@@ -268,7 +270,7 @@ def _derivatives(
         covariance_by_mean=residual.covariance_by_mean + by_mean,
         covariance_by_covariance=residual.covariance_by_covariance
         + by_covariance
-        + (outer + outer.mT) / 2,
+        + (by_inner_covariance + by_inner_covariance.mT) / 2,
         covariance_by_input=residual.covariance_by_input + by_input,
     )
 

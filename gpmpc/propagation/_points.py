@@ -403,11 +403,12 @@ def _with_turns(
         expected_deviations = steps[..., [states[a] for a in angles]]
     turns = whole_turns(deviations - expected_deviations)
     if states is not None:
-        # Wrapped values are never farther from each other than a turn.
+        # Two turns on, a model that wraps its angles stays where it was, up to one
+        # turn at the border; one that counts turns moves on by two.
         two_turns = torch.zeros_like(belief.mean)
         two_turns[..., [states[a] for a in angles]] = 2 * TURN
-        moved = model.predict(belief.mean + two_turns, input).mean - centre
-        counts_turns = moved[..., angles] > 1.5 * TURN
+        displacement = model.predict(belief.mean + two_turns, input).mean - centre
+        counts_turns = displacement[..., angles] > 1.5 * TURN
         turns = turns.masked_fill(counts_turns[..., None, :], 0.0)
     else:
         _warn_of_wide_angles(deviations - turns, type(model).__name__)

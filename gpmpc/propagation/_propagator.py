@@ -24,6 +24,8 @@ from gpmpc.gaussian import (
 )
 from gpmpc.signals import Signals, signals_of
 
+# the methods that make a step: who overrides one propagates in another way
+_STEPS = {"propagate", "_next_moments", "_add_noise_and_project"}
 _LAST_PLACES = 2**12  # units in it, of the round-off that a covariance may have
 
 
@@ -180,12 +182,13 @@ def _of_diagonal(sensitivity: Sensitivity) -> Sensitivity:
     """Returns derivatives whose covariance keeps its diagonal only."""
     by_mean = sensitivity.covariance_by_mean
     eye = torch.eye(by_mean.shape[-2], dtype=by_mean.dtype, device=by_mean.device)
-    eye = eye[..., None]
+    by_vector = eye[..., None]  # (k, k, 1)
+    by_matrix = by_vector[..., None]  # (k, k, 1, 1)
     return replace(
         sensitivity,
-        covariance_by_mean=eye * by_mean,
-        covariance_by_covariance=eye[..., None] * sensitivity.covariance_by_covariance,
-        covariance_by_input=eye * sensitivity.covariance_by_input,
+        covariance_by_mean=by_vector * by_mean,
+        covariance_by_covariance=by_matrix * sensitivity.covariance_by_covariance,
+        covariance_by_input=by_vector * sensitivity.covariance_by_input,
     )
 
 
@@ -234,14 +237,14 @@ def holds_for(propagator: Any, name: str) -> bool:
     """Whether what a class says of its way to propagate holds for a propagator.
 
     A subclass that propagates in another way inherits what is no longer true: from the
-    class upwards, it counts which comes first, the claim or another ``propagate``.
+    class upwards, it counts which comes first, the claim or another step.
     """
     if name in getattr(propagator, "__dict__", {}):
         return True
     for owner in type(propagator).__mro__:
         if name in vars(owner):
             return True
-        if "propagate" in vars(owner) or "_next_moments" in vars(owner):
+        if not _STEPS.isdisjoint(vars(owner)):
             return False
     return True
 

@@ -152,7 +152,9 @@ class DualActiveSet:
         P, q, G, lower, upper = problem
         caps, memory, record_size, x_slice = workplace
         record = _empty(record_size)
-        status = _MISUSE  # until the kernel has run; ``_finish`` finds out why not
+        # until the kernel has run. Where it has not, ``_finish`` finds out why: misuse,
+        # or arguments to be converted first, as an active set for a warm start
+        status = _MISUSE
         try:
             guess = _NO_RECORD
             if warm_start is not None:
@@ -190,10 +192,13 @@ class DualActiveSet:
 
         The last one serves as long as prices stay, as they do from step to step.
         """
-        last = self._priced_workplaces.get(shape)
-        if last is not None and np.array_equal(last[0][shape[1] :], prices):
-            return last
-        # Another thread may be at work with the last one: its memory is left alone.
+        previous_workplace = self._priced_workplaces.get(shape)
+        if previous_workplace is not None:
+            previous_prices = previous_workplace[0][shape[1] :]
+            if np.array_equal(previous_prices, prices):
+                return previous_workplace
+        # Prices stand in the memory. Another thread may be between two kernel calls of
+        # a solve with the previous ones: theirs is left alone.
         workplace = self._workplace(shape, prices)
         self._priced_workplaces[shape] = workplace
         return workplace

@@ -306,7 +306,10 @@ def _solve_opened(work, guess, out):
         count = list_violated(work, 0.0 if finest else -error)
         if count == 0:
             break
-        must_iterate = finest  # else x is refined once more before these are believed
+        # violations of an x that is not as good as can be are not believed yet: the
+        # next round only refines it
+        refines_once_more = not finest
+        must_iterate = not refines_once_more
         finest = True
     unsure = passed_over or rounds == _ROUNDS  # of the violations that are left
     if unsure and status == SOLVED and worst_violation(work) > _TOLERATED_IF_DEPENDENT:
@@ -381,11 +384,11 @@ def _least_pivot_share(work, k):
 
     It is no larger than that of P.
     """
-    share = work.pivot_share
+    smallest = work.pivot_share
     for i in range(k):
         reciprocal = work.factor[i, i]
-        share = min(share, 1.0 / (reciprocal * reciprocal * work.diagonal[i]))
-    return share
+        smallest = min(smallest, 1.0 / (reciprocal * reciprocal * work.diagonal[i]))
+    return smallest
 
 
 @inline_njit

@@ -465,15 +465,15 @@ class _AccurateSolver:
         W = np.array(list(self.working), dtype=int)
         sides = np.array(list(self.working.values()), dtype=int)
         weights = np.abs(combination) * self.norms[W]
-        used = weights > self.dependent_distance * self.norms[p]
-        W = W[used]
-        sides = sides[used]
-        r = combination[used]
+        has_weight = weights > self.dependent_distance * self.norms[p]
+        W = W[has_weight]
+        sides = sides[has_weight]
+        r = combination[has_weight]
         Q, R = qr(self.columns[:, W], mode="economic")
         for _ in range(3):
-            rest = _sum_products([(self.C[W].T, -r)], self.C[p])
+            residual = _sum_products([(self.C[W].T, -r)], self.C[p])
             r = r + solve_triangular(
-                R, Q.T @ solve_triangular(self.L, rest, lower=True)
+                R, Q.T @ solve_triangular(self.L, residual, lower=True)
             )
         # where a bound cannot pull that way it is rounding
         wrong = (-sense * r * sides < 0.0) & (self.lower[W] < self.upper[W])
@@ -524,7 +524,7 @@ def _sum_products(products: list[tuple[Array, Array]], constant: Array) -> Array
             + A_low * v_low,
         ]
     total = np.concatenate(terms, axis=1)
-    rest = np.zeros(len(constant))
+    rounding = np.zeros(len(constant))
     while total.shape[1] > 1:
         if total.shape[1] % 2:
             total = np.column_stack([total, np.zeros(len(constant))])
@@ -532,8 +532,8 @@ def _sum_products(products: list[tuple[Array, Array]], constant: Array) -> Array
         b = total[:, 1::2]
         total = a + b
         part = total - a
-        rest += ((a - (total - part)) + (b - part)).sum(axis=1)
-    return total[:, 0] + rest
+        rounding += ((a - (total - part)) + (b - part)).sum(axis=1)
+    return total[:, 0] + rounding
 
 
 def _leading_half(a: Array) -> Array:

@@ -39,13 +39,19 @@ def _as_float_array(
     It is ``value`` itself if that is one.
     """
     array = None
-    # of a complex array NumPy would drop the imaginary part, of a masked one the mask
-    if not (np.iscomplexobj(value) or np.ma.is_masked(value)):
-        try:
+    try:
+        # of a complex array NumPy would drop the imaginary part, of a masked one the
+        # mask; texts it would read
+        is_real = np.asarray(value).dtype.kind not in "cSU"
+        if is_real and not np.ma.is_masked(value):
             # a matrix is multiplied as no array is: "E"
             array = np.require(value, np.float64, ["C", "A", "W", "E"])
-        except (TypeError, ValueError):
-            array = None
+    except (
+        TypeError,
+        ValueError,
+        RuntimeError,
+    ):  # torch's, of a graph or another device
+        pass
     if array is None:
         raise ProblemError(f"{name} must be an array of real numbers; got {value!r}")
     # for NumPy an axis of length 1 may have any stride

@@ -162,10 +162,12 @@ class QPSolution(NamedTuple):
         _, _, G, lower, upper = self.arrays
         x = self.x
         n = len(x)
-        violates_upper = np.concatenate([x, G @ x]) > upper
-        paid_for = np.where(violates_upper, self.multipliers, -self.multipliers)
+        # what is not beyond its upper bound is measured at its lower one: it is beyond
+        # that, or within both and has no violation
+        beyond_upper = np.concatenate([x, G @ x]) > upper
+        paid_for = np.where(beyond_upper, self.multipliers, -self.multipliers)
         unpaid = np.where(paid_for >= self.caps, 0.0, violation)
-        bound = np.abs(np.where(violates_upper, upper, lower))
+        bound = np.abs(np.where(beyond_upper, upper, lower))
         entries = np.maximum(np.abs(x), zero_entries)
         terms = np.concatenate([entries, np.abs(G) @ entries])
         terms[n:][~G.any(axis=1)] = zero_row_size(G, lower, upper)
@@ -323,7 +325,14 @@ def _read_active_set(active_set: ArrayLike, M: int) -> Array:
     Raises:
         ProblemError: It has another shape, or holds no numbers.
     """
-    active = np.asarray(active_set)
+    try:
+        active = np.asarray(active_set)
+    except (
+        TypeError,
+        ValueError,
+        RuntimeError,
+    ):  # of unequal rows; torch's, of a graph
+        active = np.asarray(None)
     if active.shape != (M,) or active.dtype.kind not in "iuf":
         raise ProblemError(
             f"a warm start must be a solution or an active set of shape {(M,)}, "
@@ -350,14 +359,14 @@ def proves_infeasibility(
     n = G.shape[1]
     if caps is not None:
         ray = np.where(np.isfinite(caps), 0.0, ray)
-    rest = ray[:n] + ray[n:] @ G
+    residual = ray[:n] + ray[n:] @ G
     rounding = _ROUNDING_OF_SUMS * (np.abs(ray[:n]) + np.abs(ray[n:]) @ np.abs(G))
     repaired = ray.copy()
-    repaired[:n] -= np.where(np.abs(rest) > rounding, rest, 0.0)
+    repaired[:n] -= np.where(np.abs(residual) > rounding, residual, 0.0)
     bounds = np.where(repaired > 0, upper, lower)
-    used = repaired != 0
-    products = repaired[used] * bounds[used]
-    if (np.abs(bounds[used]) >= ABSENT).any() or not np.isfinite(products).all():
+    has_weight = repaired != 0
+    products = repaired[has_weight] * bounds[has_weight]
+    if (np.abs(bounds[has_weight]) >= ABSENT).any() or not np.isfinite(products).all():
         return False
     sizes = np.abs(products).sum() + np.abs(ray[n:])[
         ~G.any(axis=1)

@@ -1,9 +1,17 @@
 import gpytorch
+import numpy as np
 import pytest
 import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError
-from gpmpc.gp import GPPosterior, Scaling, exact_inference, from_gpytorch, to_gpytorch
+from gpmpc.gp import (
+    GPPosterior,
+    Scaling,
+    backend,
+    exact_inference,
+    from_gpytorch,
+    to_gpytorch,
+)
 
 
 def posterior(size=30, n=2, m=1, predicts="next_state", seed=0):
@@ -46,6 +54,28 @@ def test_a_model_of_gpytorch_is_where_its_posterior_is():
     again = from_gpytorch(to_gpytorch(gp), input_dim=gp.input_dim)
     assert again.device == gp.device
     assert torch.allclose(again.weights, gp.weights)
+
+
+@pytest.mark.parametrize("choice", ["compiled", "torch"])
+def test_states_and_inputs_of_any_kind_are_linearised_at(choice):
+    gp = posterior()
+    x = np.linspace(-1.0, 1.0, 6).reshape(3, 2)
+    u = np.array([[0.1], [0.2], [0.3]])
+    with backend(choice):
+        expected = gp.linearize(x, u)
+        of_lists = gp.linearize(x.tolist(), u.tolist())
+        of_tensors = gp.linearize(torch.from_numpy(x), torch.from_numpy(u))
+        backwards = gp.linearize(x[::-1], u[::-1])
+    assert np.array_equal(of_lists.A, expected.A)
+    assert np.array_equal(of_tensors.A, expected.A)
+    assert np.allclose(backwards.A[::-1], expected.A, rtol=1e-12)
+
+
+def test_a_scaling_of_other_columns_is_refused():
+    one_column = Scaling(torch.zeros(1), torch.ones(1))
+    two_columns = Scaling(torch.zeros(2), torch.ones(2))
+    with pytest.raises(ShapeError, match="3 features and 2 targets; got 1 and 2"):
+        posterior().unscaled(one_column, two_columns)
 
 
 def test_a_difference_model_adds_the_state():

@@ -237,6 +237,53 @@ def test_derivatives_in_the_covariance_are_symmetric():
     assert (d.dV_dS == d.dV_dS.swapaxes(0, 1)).all()
 
 
+def test_kernels_are_handed_doubles():
+    """Their machine code would take numbers of another type for them."""
+    gp = model(n=3, m=1).to(dtype=torch.float32)
+    states = np.zeros((2, 3))
+    inputs = np.zeros((2, 1))
+    doubles = gp.to(dtype=torch.float64)
+    got = kernels.linearize_gps(
+        gp.packed, states, inputs, True, gp.offset.numpy(), False
+    )
+    offset = doubles.offset.numpy()
+    expected = kernels.linearize_gps(
+        doubles.packed, states, inputs, True, offset, False
+    )
+    for ours, theirs in zip(got, expected, strict=True):
+        close(ours, theirs, 1e-12)
+    window = kernels.Window.empty(
+        gp.lengthscales.numpy(), gp.signal_variance.numpy(), state_dim=3, capacity=2
+    )
+    assert (
+        window.arrays.inverse_squares.dtype == window.arrays.log_signal.dtype == float
+    )
+
+
+def test_gps_that_cannot_predict_are_refused():
+    gp = model(n=3, m=1)
+    states = np.zeros((2, 3))
+    inputs = np.zeros((2, 1))
+    with pytest.raises(ShapeError, match="3 GPs have as many prior means"):
+        kernels.linearize_gps(gp.packed, states, inputs, True, np.zeros(2), False)
+    few = pack(
+        gp.features.numpy(),
+        gp.lengthscales[:2].numpy(),
+        gp.signal_variance[:2].numpy(),
+        gp.cholesky[:2].numpy(),
+        gp.weights[:2].numpy(),
+        state_dim=3,
+    )
+    with pytest.raises(ShapeError, match="2 GPs .* got .* 3 states"):
+        kernels.linearize_gps(few, states, inputs, True, np.zeros(2), True)
+    empty = kernels.Window.empty(np.ones((1, 4)), np.ones(1), state_dim=3, capacity=3)
+    one = empty.append(np.zeros(4), np.zeros(1), np.ones(1))
+    two = one.append(np.ones(4), np.ones(1), np.ones(1))
+    for window in (empty, two.without([0])):
+        with pytest.raises(SettingError, match="rows of its factor"):
+            kernels.linearize_gps(window, states, inputs, True, np.zeros(1), False)
+
+
 def test_outputs_need_not_be_as_many_as_states():
     gp = model(n=4, m=1)
     at = belief(4)

@@ -209,6 +209,26 @@ def test_a_root_without_derivative_is_constant_in_closed_form():
             assert torch.allclose(getattr(closed_form, part), value, atol=1e-8)
 
 
+def test_derivatives_are_those_of_a_subclass_with_another_noise():
+    class Doubled(Linearization):
+        def _add_noise_and_project(self, model, moments):
+            return super()._add_noise_and_project(
+                model, moments._replace(covariance=2 * moments.covariance)
+            )
+
+    class WithoutCorrelations(MeanEquivalence):
+        diagonal = True
+
+    gp = MODELS["next state"]
+    at = Gaussian(draw(3), torch.eye(3))
+    for propagator in (Doubled(), WithoutCorrelations()):
+        result, slopes = differentiate(propagator, gp, at, torch.zeros(2))
+        expected, automatic = by_autograd(propagator, gp, at, torch.zeros(2))
+        assert torch.allclose(result.belief.covariance, expected.belief.covariance)
+        for part, value in vars(automatic).items():
+            assert torch.allclose(getattr(slopes, part), value, atol=1e-8)
+
+
 def test_nobody_has_derivatives_too():
     nobody = Gaussian(draw(0, 3), draw(0, 3, 3))
     with backend("torch"):

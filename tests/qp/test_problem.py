@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import torch
 
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
@@ -253,7 +254,13 @@ class TestArraysOfOtherKinds:
         np.testing.assert_allclose(solution.x, [0.5, 0.5])
 
     @pytest.mark.parametrize(
-        "q", [[1.0, 2.0 + 1j], np.ma.masked_array([1.0, 2.0], mask=[0, 1])]
+        "q",
+        [
+            [1.0, 2.0 + 1j],
+            np.ma.masked_array([1.0, 2.0], mask=[0, 1]),
+            ["1", "2"],
+            torch.ones(2, requires_grad=True),
+        ],
     )
     def test_numbers_that_are_not_real_or_masked_are_refused(self, q):
         with pytest.raises(ProblemError, match="q must be an array of real numbers"):
