@@ -270,10 +270,19 @@ class GPPosterior(TensorModel):
     def on_host(self) -> bool:
         """Whether compiled loops can evaluate it: constant float64 in host memory.
 
-        It is asked each time: within ``torch.no_grad`` everything is constant.
+        Within ``torch.no_grad`` everything is constant.
         """
-        is_constant = constant_arrays(*self.prediction_tensors) is not None
-        return is_constant and self.dtype is torch.float64
+        if not self._can_be_on_host:
+            return False
+        return not torch.is_grad_enabled() or not any(
+            tensor.requires_grad for tensor in self.prediction_tensors
+        )
+
+    @cached_property
+    def _can_be_on_host(self) -> bool:
+        """Whether it is float64 in host memory that no function transform follows."""
+        numbers = [tensor.detach() for tensor in self.prediction_tensors]
+        return self.dtype is torch.float64 and constant_arrays(*numbers) is not None
 
     @cached_property
     def _offset_array(self) -> Array:
