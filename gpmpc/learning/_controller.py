@@ -120,8 +120,11 @@ class LearningController:
         if not is_measured(measured).all():
             return learned.later()
         input = learned.input_of_policy
-        if np.array_equal(previous.means[0], learned.planned_state):
-            input = previous.input  # that of a decision at the last measurement
+        was_decided_at_last_measurement = np.array_equal(
+            previous.means[0], learned.planned_state
+        )
+        if was_decided_at_last_measurement:
+            input = previous.input
         if input is None:
             return learned.after_gap(measured)
         try:

@@ -105,6 +105,19 @@ class LearningState:
 
     Its model's time moves on once a step: every path through ``learn_from_step`` ends
     in one ``later``, and each new plant moves on where it is stored.
+
+    What plans (``planning``) and from where (``assumed``, ``planned_state``):
+
+    ===========================  ====================================  =================
+    last measurement             model                                 state
+    ===========================  ====================================  =================
+    not in doubt                 with its change where it is active    measured
+    in doubt, bridged            likewise                              expected
+    in doubt, a new plant tried  the new plant's                       measured, or its
+                                                                       expected one
+    else, in doubt for one step  with its change where it is active    measured
+    else, in doubt for longer    as it was learned                     measured
+    ===========================  ====================================  =================
     """
 
     model: ChangedModel  #: the model with its change

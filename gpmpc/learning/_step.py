@@ -247,6 +247,7 @@ def _new_plant(
     observed = step._replace(
         point=np.concatenate([z[0], v[0], [model.time]]),
         observed_change=from_change @ error,
+        # What predicts adds the latent variance again.
         noise_variance=np.maximum(variance - step.latent_variance, step.noise_variance),
     )
     comparison = model.predict_then_learn(observed)
@@ -296,6 +297,7 @@ def _acts_like_input(
     remaining = np.linalg.norm(errors - effects @ coefficients)
     tolerance = max(_MISALIGNED * float(np.linalg.norm(errors)), deviations)
     aligned = remaining <= tolerance
+    # As many independent effects as outputs explain any errors.
     return bool(several and aligned and rank < len(errors))
 
 

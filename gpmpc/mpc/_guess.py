@@ -239,11 +239,9 @@ def is_contradicted(guess: Plan, stages: Stages, ranges: Array) -> bool:
 
     Args:
         guess: A first plan.
-        stages: Linearised along it; one that is held contradicts nothing.
+        stages: Linearised along it.
         ranges: Of the states in the model's data (n,), infinite where they are unknown.
     """
-    if len(stages.next) != len(guess.inputs):
-        return False
     return _leads_away(stages.next, stages.A, stages.B, guess.states, ranges)
 
 

@@ -284,7 +284,7 @@ class ControlLoop:
         self.judgement: Judgement | None = None
         self._steps = 0
         self._judge: FlightJudge | None = None
-        self._before_last: Command | None = None
+        self._command_before: Command | None = None
         # Of the last state; plans may be of more. None before the first call.
         self._measured_dim: int | None = None
         self._parameters: Any = None  # of the last call
@@ -331,7 +331,7 @@ class ControlLoop:
             parameters=parameters,
             plan=plan,
         )
-        self._before_last = self.last
+        self._command_before = self.last
         self._parameters = parameters
         self.last = command
         self.failures = self.failures + command.failed
@@ -399,7 +399,7 @@ class ControlLoop:
             correction = self._gains_of(plan)[stage][:, :n] @ error
             if np.isfinite(correction).all():
                 input = input - correction
-        last_input = _input_before(self.controller, self._before_last)
+        last_input = _input_before(self.controller, self._command_before)
         if stage > 0:
             last_input = plan.inputs[stage - 1]
         return _within_bounds(self.controller, input, last_input)

@@ -279,9 +279,9 @@ class GPMPC:
         The latter where the model contradicts the guess: derivatives along states that
         no motion takes, multiplied over the horizon, may grow beyond any number; and
         where it has no number at a stage. States that were handed over are taken as
-        they are.
+        they are, and one point that is held contradicts nothing.
         """
-        if request.guessed_states is not None:
+        if request.guessed_states is not None or self.prediction.is_held:
             return local
         if not is_contradicted(local.plan, local.stages, self._state_ranges):
             return local
@@ -598,13 +598,15 @@ class _ControlStep:
             self._stopwatch.lap("solve")
             if not _solution_is_usable(program, solution, local.plan):
                 # The plan of the round before is the last one.
-                if local.plan is not guess:
+                has_left_guess = local.plan is not guess
+                if has_left_guess:
                     local = self._close_defects(local, local, program)
                 return self._conclude(local, guess, solution, solution.status)
             iterate = self._take_step(local, program, solution)
             if iterate.status is None and self._may_go_on:
                 local = iterate.local
-                if local.plan is not guess:
+                has_left_guess = local.plan is not guess
+                if has_left_guess:
                     self._ending = _Ending(local, program, solution)
                 continue
             last_problem = self._rolled_out_where_needed(iterate, local, program)
@@ -697,8 +699,9 @@ class _ControlStep:
         """Whether the step may be taken whole, as in the real-time iteration.
 
         It may be by the first program of a decision that has a last plan to compare
-        with. Under curved rows first plans may, too: a program is judged by the plan it
-        leads to.
+        with, where it starts from another plan that was handed over, too: what counts
+        is how far the last decision's step led. Under curved rows first plans may as
+        well: a program is judged by the plan it leads to.
         """
         is_first_program = self._programs == 1
         number_is_open = self._controller.iterations is None
@@ -752,10 +755,11 @@ class _ControlStep:
         return bool((missed.max(axis=0) > MISS_RATIO * promised + KEPT).any())
 
     def _takes_plan_back(self, ending: LocalProblem) -> bool:
-        """Returns whether a solved plan that breaks a promise counts as unsolved.
+        """Returns whether SOLVED becomes a limit, as a plan breaks its promise.
 
-        Where a single program was asked for, its plan is taken as it is. Where more
-        were, one that misses a hard row is: as unsolved it would not be applied.
+        It stays where a single program was asked for, and where a hard row is missed:
+        as unsolved that plan would not be applied, and it is to be, as
+        ``HARD_BOUND_MISSED``.
         """
         if self._most_programs == 1:
             return False
@@ -782,7 +786,8 @@ class _ControlStep:
         suboptimal = False
         if not status.solved:
             misses = self._prediction.misses_hard_rows(local, FEASIBLE)
-            suboptimal = plan is not guess and not misses
+            has_left_guess = plan is not guess
+            suboptimal = has_left_guess and not misses
             if not suboptimal:
                 return self._failed_decision(solution, status)
         violation = self._violation(local)
