@@ -2,6 +2,7 @@
 
 import math
 import zipfile
+from collections.abc import Set
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,20 +29,32 @@ class _DeclaredArray(NamedTuple):
 
     @property
     def is_table(self) -> bool:
-        """Whether it is a number, or has columns of numbers or short texts."""
+        """Whether it is a number, or has columns of numbers, times or short texts."""
         if not self.shape:
             return self.is_number
-        return len(self.shape) in (1, 2) and self.dtype.kind in "biufSU"
+        return len(self.shape) in (1, 2) and self.dtype.kind in "biufSUmM"
 
     @property
     def is_row(self) -> bool:
         """Whether it is one row of several values."""
         return len(self.shape) == 2 and self.shape[0] == 1 and self.shape[1] > 1
 
-    @property
-    def columns(self) -> int:
-        """Number of columns that it becomes."""
-        return 1 if self.is_row else math.prod(self.shape[1:])
+    def is_sideways(self, lengths: Set[int]) -> bool:
+        """Tells whether its columns are those of a log and not its rows.
+
+        ``lengths`` are those of the archive's arrays of one dimension.
+        """
+        if len(self.shape) != 2:
+            return False
+        rows, columns = self.shape
+        is_as_long = columns in lengths and rows not in lengths
+        return self.is_row or (is_as_long and rows < columns)
+
+    def count_columns(self, lengths: Set[int]) -> int:
+        """Returns the number of columns that it becomes."""
+        if self.is_sideways(lengths):
+            return self.shape[0]
+        return math.prod(self.shape[1:])
 
     @property
     def is_number(self) -> bool:
@@ -51,35 +64,44 @@ class _DeclaredArray(NamedTuple):
 def read_npz(path: Path, options: ReadOptions) -> LogFile:
     """Reads the arrays of an archive as the columns of one table.
 
-    An array has its columns side by side. One of a single row is a column: those of
-    MATLAB are row vectors.
+    An array has its columns side by side, or below each other where these are as long
+    as the arrays of one dimension. One of a single row is a column: those of MATLAB are
+    row vectors.
     """
     declared = _declared_arrays(path)
     tables = {name: array for name, array in declared.items() if array.is_table}
-    _take_memory(path, tables)
+    lengths = {array.shape[0] for array in tables.values() if len(array.shape) == 1}
+    _take_memory(path, tables, lengths)
     columns: dict[str, np.ndarray] = {}
     with np.load(path, allow_pickle=False) as archive:
         for name, array in tables.items():
             values = np.atleast_1d(archive[name])
+            if array.dtype.kind == "S":
+                values = np.char.decode(values, "utf-8", "replace")
             if array.is_row:
                 columns[name] = values[0]
                 continue
             if len(array.shape) < 2:
                 columns[name] = values
                 continue
-            for i, column in enumerate(values.T):
+            columns_first = values if array.is_sideways(lengths) else values.T
+            for i, column in enumerate(columns_first):
                 columns[f"{name}[{i}]"] = column
     unread = sorted(declared.keys() - tables.keys())
     return LogFile({"": padded_table(columns)}, unread_columns(path, unread))
 
 
-def _take_memory(path: Path, tables: dict[str, _DeclaredArray]) -> None:
+def _take_memory(
+    path: Path, tables: dict[str, _DeclaredArray], lengths: Set[int]
+) -> None:
     """Counts what arrays take before they are read."""
     budget = MemoryBudget(path)
-    check_column_count(path, sum(array.columns for array in tables.values()))
+    check_column_count(
+        path, sum(array.count_columns(lengths) for array in tables.values())
+    )
     for name, array in tables.items():
         bytes_per_cell = NUMBER_BYTES
-        if not array.is_number:
+        if array.dtype.kind in "SU":
             bytes_per_cell = TEXT_BYTES + 2 * array.dtype.itemsize
         label = f"array {name!r} of shape {array.shape}"
         budget.take(math.prod(array.shape) * bytes_per_cell, label)

@@ -14,6 +14,7 @@ from gpmpc.logs._units import unit_at_end, unit_in_name, units_of
 TIMES = (STAMP, "timestamp", "t", "time", "stamp", "Time", "seconds")
 LATEST_UNSTATED = 1e11  # [s] since 1970, in the year 5138
 LONGEST_UNSTATED = 3600.0  # [s] between rows whose stamps nobody gave a unit
+EARLIEST_DATE = 1e9  # [s] since 1970: stamps from there on are rather in s
 
 
 def time_unit(table: pd.DataFrame, column: str) -> str:
@@ -91,6 +92,25 @@ def _check_unstated_unit(where: str, times: Array, column: str) -> None:
     raise DataError(
         f"{where}: {doubt} if {column} is in s: in which unit is it? (time: {{column: "
         f"{column}, unit: us}}, or s, ms, ns)"
+    )
+
+
+def doubt_of_unit(table: pd.DataFrame, column: str, unit: str, times: Array) -> str:
+    """Says that times (K,) [s] may be of another unit; empty where they may not.
+
+    They may where nobody stated one and they are whole numbers, as a counter of ms is.
+    """
+    is_stated = unit or time_unit(table, column) or holds_times(table, column)
+    times = times[np.isfinite(times)]
+    steps = np.abs(np.diff(times))
+    if is_stated or not len(steps) or times.max() > EARLIEST_DATE:
+        return ""
+    if (times % 1 != 0).any():
+        return ""
+    return (
+        f"{column} has whole numbers, whose unit nobody stated: rows are taken as "
+        f"{np.median(steps):.3g} s apart; of ms, state time: {{column: {column}, "
+        "unit: ms}"
     )
 
 

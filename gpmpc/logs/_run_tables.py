@@ -30,7 +30,7 @@ from gpmpc.logs._resampling import (
     grid_of_rows,
     resample,
 )
-from gpmpc.logs._row_times import read_times, row_times, unread_times
+from gpmpc.logs._row_times import doubt_of_unit, read_times, row_times, unread_times
 from gpmpc.logs._signals import nan_zero_dropouts, read_column, read_signal
 from gpmpc.logs._units import conversion, is_known, units_of
 
@@ -118,7 +118,7 @@ def _read_topic(
         where = f"{where}, {topic}"
     table = _stamped_rows(topic, table, findings)
     hint = ORDER_TOPICS if topic else ORDER_ROWS
-    times = _read_time(topic, where, table, mapping)
+    times = _read_time(topic, where, table, mapping, findings)
     has_time = np.isfinite(times)
     if has_time.any() and not has_time.all():
         count = int((~has_time).sum())
@@ -197,11 +197,18 @@ def _stamped_rows(
 
 
 def _read_time(
-    topic: str, where: str, table: pd.DataFrame, mapping: LogMapping
+    topic: str,
+    where: str,
+    table: pd.DataFrame,
+    mapping: LogMapping,
+    findings: RunFindings,
 ) -> Array:
     """Reads the stamps (K,) [s] of a table, in the order of the file."""
     if mapping.time:
-        return read_times(where, table, mapping.time, mapping.time_unit)
+        times = read_times(where, table, mapping.time, mapping.time_unit)
+        doubt = doubt_of_unit(table, mapping.time, mapping.time_unit, times)
+        findings.add("unit of the time", len(times) if doubt else 0, doubt)
+        return times
     stamps = row_times(where, table, mapping)
     if stamps is not None:
         return stamps

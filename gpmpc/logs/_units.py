@@ -68,7 +68,7 @@ _UNITS_KEY = "units"  # in the ``attrs`` of a table
 _TIME_WITH_UNIT = re.compile(
     r"(?:[Tt]ime|[Tt]imestamp|t)(?: ?[\[(](s|ms|us|ns)[\])]|_(s|ms|us|ns))"
 )
-_TIME_US = "TimeUS"
+_TIMES_BY_NAME = {"TimeUS": "us", "millis": "ms", "micros": "us"}  # and their units
 _ENDS_WITH_UNIT = re.compile(r".*_(ms|us|ns|msec|usec|nsec)")  # time_boot_ms
 _NAME_WITH_UNIT = re.compile(r".*\S ?(?:\[([^\[\]]+)\]|\(([^()]+)\))")
 _FACTOR = re.compile(r"([A-Za-z%]+)\^?((?:-?\d)?)")
@@ -115,8 +115,8 @@ def unit_in_name(column: str) -> str:
     >>> unit_in_name("t_ms"), unit_in_name("time [us]"), unit_in_name("t")
     ('ms', 'us', '')
     """
-    if column == _TIME_US:
-        return "us"
+    if column in _TIMES_BY_NAME:
+        return _TIMES_BY_NAME[column]
     match = _TIME_WITH_UNIT.fullmatch(column)
     return (match[1] or match[2]) if match is not None else ""
 

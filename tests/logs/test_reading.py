@@ -380,6 +380,26 @@ def test_inputs_in_any_unit_of_force_are_thrusts(tmp_path, unit, thrusts):
     assert nominal.thrusts == thrusts
 
 
+def test_arrays_of_dates_of_bytes_and_side_by_side_are_read(tmp_path):
+    table = pendulum_table()
+    steps = (1000 * table["t"]).round().astype("timedelta64[ms]").to_numpy()
+    np.savez(
+        tmp_path / "log.npz",
+        t=np.datetime64("2024-05-01") + steps,
+        run=np.repeat([b"a", b"b"], 200),
+        x=table[["angle", "rate"]].to_numpy().T,
+        torque=table["torque"],
+        gains=np.ones((50, 2)),
+    )
+    states = {"angle": ["x[0]"], "rate": ["x[1]"]}
+    mapping = {**PENDULUM, "states": states, "run": "run"}
+    log = read_log(tmp_path / "log.npz", mapping)
+    assert [run.name for run in log] == ["log:a", "log:b"]
+    assert log.time_step == pytest.approx(0.02)
+    states = np.concatenate([run.states for run in log])
+    np.testing.assert_array_equal(states, table[["angle", "rate"]])
+
+
 @pytest.mark.parametrize("rows", [10, 100])
 def test_a_run_in_which_a_signal_never_changes_is_left_out(tmp_path, rows):
     still = body_table(rows)
@@ -493,7 +513,8 @@ def test_slow_and_steady_motion_is_not_rest(tmp_path, step):
         mapping = {"time": "t", "states": {"x": [state]}, "inputs": {"u": ["drive"]}}
         assert len(read_log(written(tmp_path, table), mapping)) == rows
     with_holes = table.assign(slow=np.where(np.arange(rows) % 40, slow + 9, np.nan))
-    mapping = {"time": "t", "states": {"x": ["slow"]}, "inputs": {"u": ["drive"]}}
+    time = {"column": "t", "unit": "s"}
+    mapping = {"time": time, "states": {"x": ["slow"]}, "inputs": {"u": ["drive"]}}
     log = read_log(written(tmp_path, with_holes), mapping)
     assert kinds(log) == {"empty sample": 50, "missing value": 50}
     standing = pandas.DataFrame(

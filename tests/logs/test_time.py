@@ -351,6 +351,7 @@ SIGNALS = {"states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
         ("t,x,u\nms,m,N\n", {"time": "t", **SIGNALS}),
         ("t,x,u\n(ms),(m),(N)\n\n", {"time": "t", **SIGNALS}),
         ("t_ms,x,u\n", {"time": 1, **SIGNALS}),
+        ("millis,x,u\n", {"time": "millis", **SIGNALS}),
         ("time_boot_ms,x,u\n", {"time": "time_boot_ms", **SIGNALS}),
         ("elapsed_msec,x,u\n", {"time": "elapsed_msec", **SIGNALS}),
         ("t_ms,x,u\n", {"time": "t", "names": ["t"], **SIGNALS}),
@@ -363,6 +364,18 @@ def test_the_unit_that_a_file_says_of_its_times_is_taken(tmp_path, header, mappi
     log = read_log(tmp_path / "a.csv", mapping)
     assert log.time_step == pytest.approx(0.02)
     assert not kinds(log)
+
+
+def test_whole_numbers_without_a_unit_are_noted(tmp_path):
+    rows = [f"{20 * k},{k % 7},{k % 3}\n" for k in range(60)]
+    (tmp_path / "a.csv").write_text("t,x,u\n" + "".join(rows))
+    log = read_log(tmp_path / "a.csv", {"time": "t", **SIGNALS})
+    assert kinds(log) == {"unit of the time": 60}
+    assert "rows are taken as 20 s apart; of ms, state time: {column: t, unit" in texts(
+        log
+    )
+    stated = {"time": {"column": "t", "unit": "s"}, **SIGNALS}
+    assert not kinds(read_log(tmp_path / "a.csv", stated))
 
 
 def test_stamps_of_a_far_year_are_in_another_unit(tmp_path):
