@@ -54,6 +54,7 @@ from gpmpc.gp import (
     Transitions,
     informative_points,
 )
+from gpmpc.gp._kernel import kernel_matrix
 from gpmpc.gp._sparse import sparse_posterior
 from gpmpc.gp._transitions import check_transitions
 from gpmpc.models import NoisyModel, ResidualModel
@@ -109,8 +110,9 @@ def estimate_process_noise(
     """Estimates the noise of a model's outputs from transitions in their order of time.
 
     Args:
-        model: Predicts next states. Rows that GPs of it were trained on are predicted
-            without their block; those of pseudo-observations cannot be.
+        model: Predicts next states. Rows that GPs of it were trained on, and rows
+            between them, are predicted without their block; those of
+            pseudo-observations cannot be.
         transitions: All rows of one log or several; where x[k+1] of a row is not x[k]
             of the next, a new run begins.
         block: Rows that are left out together: more than errors are correlated over.
@@ -218,8 +220,9 @@ def residuals(model: Any, transitions: Transitions, block: int) -> Residuals:
     """Computes the errors of a model's outputs at transitions.
 
     Args:
-        model: Predicts next states. Rows that GPs of it were trained on are predicted
-            without their block; those of pseudo-observations cannot be.
+        model: Predicts next states. Rows that GPs of it were trained on, and rows
+            between them, are predicted without their block; those of
+            pseudo-observations cannot be.
         transitions: In their order of time.
         block: Rows that are left out together.
 
@@ -297,6 +300,10 @@ def _leave_out_blocks(
 ) -> Residuals:
     """Returns residuals as if rows that the GPs were trained on had been left out.
 
+    Rows between them, which match no point, are predicted without the points of those
+    rows, too: by their neighbours in time errors that hang together would be explained.
+    Rows farther than a block from all of them keep their error by all points.
+
     Args:
         trained: The GPs.
         block: Rows that are left out together.
@@ -306,7 +313,17 @@ def _leave_out_blocks(
     errors = in_sample.errors.clone()
     latent = in_sample.latent.clone()
     pairs = _rows_and_points(trained, errors)
-    for rows, points in (part.unbind(1) for part in pairs.split(block)):
+    block_between = _blocks_of_rows_between(
+        pairs[:, 0].contiguous(), len(errors), block
+    )
+    for index, (rows, points) in enumerate(
+        part.unbind(1) for part in pairs.split(block)
+    ):
+        between = (block_between == index).nonzero()[:, 0]
+        change = _change_without_points(trained, between, points)
+        effect = trained.effect[between]
+        errors[between] += (effect @ change.errors[..., None])[..., 0]
+        latent[between] += (effect.square() @ change.latent[..., None])[..., 0]
         own_errors = trained.errors_of_points[points]
         left_out_errors = torch.zeros_like(own_errors)
         latent_variances = torch.zeros_like(own_errors)
@@ -321,6 +338,49 @@ def _leave_out_blocks(
         errors[rows] += (effect @ change[..., None])[..., 0]
         latent[rows] = (effect.square() @ latent_variances[..., None])[..., 0]
     return Residuals(errors=errors, latent=latent)
+
+
+def _blocks_of_rows_between(matched: Tensor, count: int, block: int) -> Tensor:
+    """Finds the block of matched rows beside each row that matches no point (count,).
+
+    It is that of the nearest matched row; -1 of rows that match, and of those that are
+    farther than a block from all that do.
+    """
+    blocks = torch.full((count,), -1, device=matched.device)
+    if not len(matched):
+        return blocks
+    rows = torch.arange(count, device=matched.device)
+    after = torch.searchsorted(matched, rows).clamp_max(len(matched) - 1)
+    before = (after - 1).clamp_min(0)
+    is_after_nearer = (matched[after] - rows).abs() < (matched[before] - rows).abs()
+    nearest = torch.where(is_after_nearer, after, before)
+    distance = (matched[nearest] - rows).abs()
+    is_between = (distance > 0) & (distance <= block)
+    return torch.where(is_between, nearest // block, blocks)
+
+
+def _change_without_points(
+    trained: "_TrainedGP", rows: Tensor, points: Tensor
+) -> Residuals:
+    """Returns what errors and variances of the GPs (R, k) at rows change by.
+
+    That is where some points S are left out: with k the covariances of a row with all
+    points, P the inverse of those of the targets and g = P[S] k,
+
+        error + g' P[S, S]^-1 weights[S],   variance + g' P[S, S]^-1 g
+    """
+    gp = trained.gp
+    covariances = kernel_matrix(
+        trained.features[rows], gp.features, gp.lengthscales, gp.signal_variance
+    )
+    errors = []
+    variances = []
+    for a in range(gp.output_dim):
+        gains = covariances[a] @ gp.precision[a][:, points]
+        weighted = torch.linalg.solve(gp.precision[a][points][:, points], gains.mT).mT
+        errors.append(weighted @ gp.weights[a, points])
+        variances.append((weighted * gains).sum(-1))
+    return Residuals(torch.stack(errors, dim=-1), torch.stack(variances, dim=-1))
 
 
 def _rows_and_points(trained: "_TrainedGP", errors: Tensor) -> Tensor:

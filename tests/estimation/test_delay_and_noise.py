@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from gpmpc.estimation import estimate_delay, estimate_process_noise, with_process_noise
+from gpmpc.estimation._noise import residuals
 from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gp import GPPosterior, SparseTrainer, Trainer, Transitions
 from gpmpc.models import Affine, DelayedModel, NoisyModel, ResidualModel
@@ -212,6 +213,30 @@ def test_rows_that_were_trained_on_count_as_if_they_had_not_been():
     again = estimate_process_noise(without, data[:20])
     assert torch.allclose(held_out.variance, again.variance, rtol=1e-6)
     assert (estimate_process_noise(model, data).variance > in_sample).all()
+
+
+def test_rows_between_those_that_were_trained_on_are_left_out_with_them():
+    data = transitions(*log(200, 0, 3, std=(2e-3, 0.03)))
+    gp = Trainer(predicts="difference", restarts=0)(data[::2]).posterior
+    rows = data[:39]  # every second one is one of the first 20 points
+    found = residuals(gp, rows, block=20)
+    expected = residuals(without_rows(gp, range(20)), rows, block=20)
+    assert torch.allclose(found.errors, expected.errors, rtol=1e-6, atol=1e-9)
+    assert torch.allclose(found.latent, expected.latent, rtol=1e-6, atol=1e-9)
+    # errors that hang together, seen by every second row
+    rng = np.random.default_rng(0)
+    error = 0.02 * rng.normal(size=601)
+    for k in range(1, 601):
+        error[k] = 0.9 * error[k - 1] + np.sqrt(1 - 0.9**2) * error[k]
+    inputs = np.sin(np.arange(600)[:, None] * [0.035, 0.095]).sum(1, keepdims=True)
+    states = np.zeros((601, 1))
+    for k in range(600):
+        states[k + 1] = 0.95 * states[k] + 0.1 * inputs[k] + error[k]
+    every = Transitions(states[:-1], inputs, states[1:])
+    half = Trainer(predicts="difference", restarts=0)(every[::2]).posterior
+    noise = estimate_process_noise(half, every)
+    assert float(noise.variance.sqrt()) == pytest.approx(0.02, rel=0.15)
+    assert float(noise.correlation) == pytest.approx(0.9, abs=0.05)
 
 
 def at_rest_then_pushed(noise):
