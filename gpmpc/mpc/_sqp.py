@@ -41,6 +41,7 @@ from gpmpc.mpc._linear_quadratic import (
     CondensedProgram,
     Plan,
     References,
+    StageRows,
     evaluate_cost,
     weight_of_stage,
 )
@@ -312,15 +313,30 @@ class Globalization:
                 + _SUFFICIENT_DECREASE * length * min(slope, 0.0)
                 + _ROUND_OFF * abs(forecast.merit)
             )
-            judged = candidate
-            if not self._prediction.constraints.smooth:
-                # bounds stay those of the program
-                rows = local.rows._replace(E=candidate.rows.E)
-                judged = candidate._replace(rows=rows)
+            judged = candidate._replace(rows=self._judged_rows(candidate, local))
             merit = _merit.unchecked(judged, self._merit_terms, self._defect_prices)
             if merit <= largest_merit:
                 return candidate
         return None
+
+    def _judged_rows(self, trial: LocalProblem, local: LocalProblem) -> StageRows:
+        """Returns the rows at the plan of a trial, tightened as the program's are.
+
+        Programs leave out how covariances depend on the plan: a merit that counted it
+        would find that no step pays.
+        """
+        constraints = self._prediction.constraints
+        if not constraints.smooth:
+            return local.rows._replace(E=trial.rows.E)
+        if not constraints.kappas.any():
+            return trial.rows
+        return constraints.at(
+            trial.plan,
+            local.covariances,
+            self._prediction.stage_count,
+            self._request.parameters,
+            self._request.kappas,
+        )
 
     def _trials(
         self, local: LocalProblem, program: CondensedProgram, proposed: Plan

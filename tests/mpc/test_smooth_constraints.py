@@ -21,6 +21,7 @@ from gpmpc.mpc import (
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
+from tests.mpc.small_models import LinearGaussian
 from tests.mpc.systems import LinearPlant, linear_gaussian
 
 H, RADIUS = 12, 0.4
@@ -138,6 +139,45 @@ def test_a_moving_disc_is_passed_where_it_will_be():
     ]
     assert min(distances) > RADIUS - 1e-6
     assert np.allclose(states[-1], goal, atol=1e-3)
+
+
+class Drifting(LinearGaussian):
+    """A double integrator whose noise grows with its speed."""
+
+    def predict(self, state, input=None):
+        mean = super().predict(state, input).mean
+        variance = 0.02 * state[..., 1, None, None] ** 2
+        return Gaussian(mean, variance * torch.eye(2, dtype=torch.float64))
+
+
+def test_a_line_as_a_function_is_iterated_as_the_box_that_it_is():
+    """How the tube grows along a step is no part of the program, nor of its merit."""
+    model = Drifting(
+        np.array([[1.0, 0.5], [0.0, 1.0]]),
+        np.array([[0.125], [0.5]]),
+        c=np.zeros(2),
+        W=np.zeros((2, 2)),
+    )
+    box = Box([-np.inf] * 2, [1.0, np.inf], probability=0.95)
+    line = Inequality(lambda x: x[:, :1] - 1.0, probability=0.95)
+    belief = Gaussian.certain(np.array([-0.5, -0.5]))
+    reference = Reference(np.array([1.5, 1.0]))
+    programs = []
+    plans = []
+    for constraint in (box, line):
+        problem = Problem(
+            Tracking([1.0, 0.1], [0.1], penalized="inputs"),
+            Box([-3.0], [3.0]),
+            constraints=[constraint],
+        )
+        steering = GPMPC(model, Linearization(), problem, 8, [0.0], iterations=40)
+        first = steering.control(belief, reference)
+        second = steering.control(belief, reference, first)
+        assert first.status is second.status is Status.SOLVED
+        programs.append([first.iterations, second.iterations])
+        plans.append([first.inputs, second.inputs])
+    assert programs[0] == programs[1]
+    np.testing.assert_allclose(plans[0], plans[1], rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("covariance", ["zero_order", "diagonal", "full"])
