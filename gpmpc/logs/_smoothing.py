@@ -41,6 +41,8 @@ _POINTS = 100  # of the GPs
 _AVERAGE = 5  # rows over which their targets are averaged
 _STIFF = 1e-3  # least noise of the movement, over that of the measurements
 _NONE = 1e-6  # noise of a measurement without noise, over the residuals' variance
+_BLOCK = 20_000  # rows that are smoothed at once,
+_OVERLAP = 1000  # with so many of each neighbour, far more than tell of a row
 _OUTLIER = 6.0  # median absolute deviations
 
 
@@ -133,6 +135,9 @@ def _smooth_run(
 ) -> LogRun:
     """Returns a run with its most likely states.
 
+    Long runs are smoothed block by block, each with rows of its neighbours: the
+    equations of all rows of an hour at 1 kHz are many gigabytes.
+
     Args:
         model: Predicts the next state.
         run: With the measured states.
@@ -141,9 +146,40 @@ def _smooth_run(
         time_step: [s].
     """
     space = model.kinematics.space
+    lengths = difference_steps(space.difference(about.states[:-1], space.origin))
+    states = np.empty_like(run.states)
+    for first in range(0, len(run), _BLOCK):
+        last = min(first + _BLOCK, len(run))
+        begin = max(first - _OVERLAP, 0)
+        end = min(last + _OVERLAP, len(run))
+        smoothed = _most_likely_states(
+            model=model,
+            run=run.part(begin, end, "block"),
+            about=about.part(begin, end, "block"),
+            noise=noise,
+            time_step=time_step,
+            lengths=lengths,
+        )
+        states[first:last] = smoothed[first - begin : last - begin]
+    return replace(run, states=states)
+
+
+def _most_likely_states(
+    model: LogModel,
+    run: LogRun,
+    about: LogRun,
+    noise: _Noise,
+    time_step: float,
+    lengths: Array,
+) -> Array:
+    """Computes the most likely states (K, n) of K rows; see ``_smooth_run``.
+
+    ``lengths`` are those of the differences that linearise the model (e,).
+    """
+    space = model.kinematics.space
     K = len(run)
     e = space.error_dim
-    A, residuals = _linearized_steps(model, about, time_step)
+    A, residuals = _linearized_steps(model, about, time_step, lengths)
     couples = np.ones(K - 1)
     couples[np.array(run.begins[1:], dtype=int) - 1] = 0.0  # not over a gap
     information = couples[:, None] / noise.movement  # (K - 1, e)
@@ -157,11 +193,11 @@ def _smooth_run(
     right[:-1] -= (weighted @ residuals[..., None])[..., 0]
     right[1:] += information * residuals
     solution = _solve_block_tridiagonal(diagonal, below, right)
-    return replace(run, states=space.displace(about.states, solution))
+    return space.displace(about.states, solution)
 
 
 def _linearized_steps(
-    model: LogModel, run: LogRun, time_step: float
+    model: LogModel, run: LogRun, time_step: float, lengths: Array
 ) -> tuple[Array, Array]:
     """Linearises the steps of a model along a run.
 
@@ -179,7 +215,7 @@ def _linearized_steps(
 
     predicted = predict(states)
     columns = []
-    for h in np.diag(difference_steps(space.difference(states, space.origin))):
+    for h in np.diag(lengths):
         displaced = predict(space.displace(states, h))
         columns.append(space.difference(displaced, predicted) / h.sum())
     residuals = space.difference(predicted, run.states[1:])

@@ -32,7 +32,7 @@ from gpmpc.logs._rollout_corrections import (
     choose_averages,
 )
 from gpmpc.logs._search import Search
-from gpmpc.logs._smoothing import smooth
+from gpmpc.logs._smoothing import _solve_block_tridiagonal, smooth
 from gpmpc.logs._structures import (
     additions,
     affordable_rows_back,
@@ -273,7 +273,7 @@ def test_coupled_outputs_are_learned_together():
     assert (best.errors[-1] < 0.3 * linear[0].errors[-1]).all()
 
 
-def test_smoothing_takes_noise_away_and_leaves_clean_rows():
+def test_smoothing_takes_noise_away_and_leaves_clean_rows(monkeypatch):
     rng = np.random.default_rng(0)
     inputs = held_inputs(rng, 1500, 2.0)
     clean = simulate(lambda x, u: [x[1], -4 * x[0] - x[1] + u[0]], [0, 0], inputs, 0.02)
@@ -284,6 +284,21 @@ def test_smoothing_takes_noise_away_and_leaves_clean_rows():
     assert smoothed is not None
     errors = np.sqrt(np.square(smoothed.runs[0].states - clean).mean(axis=0))
     assert (errors < 0.4 * np.array([0.02, 0.05])).all()
+    # Of long runs, a block at a time makes equations.
+    monkeypatch.setattr("gpmpc.logs._smoothing._BLOCK", 400)
+    monkeypatch.setattr("gpmpc.logs._smoothing._OVERLAP", 300)
+    blocks = []
+
+    def solve(diagonal, below, right):
+        blocks.append(len(right))
+        return _solve_block_tridiagonal(diagonal, below, right)
+
+    monkeypatch.setattr("gpmpc.logs._smoothing._solve_block_tridiagonal", solve)
+    in_blocks = smooth(log_of([noisy], [inputs], step=0.02), kinematics, 0)
+    assert in_blocks is not None
+    assert max(blocks) == 1000
+    in_rows = in_blocks.runs[0].states
+    np.testing.assert_allclose(in_rows, smoothed.runs[0].states, rtol=0, atol=1e-3)
     # Steps that are random themselves are no noise of the measurement.
     walk = np.cumsum(rng.normal(size=(1500, 2)), axis=0)
     assert smooth(log_of([walk], [inputs]), kinematics, 0) is None
