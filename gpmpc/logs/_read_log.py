@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from gpmpc._bounds import MemoryBudget
 from gpmpc._calls import explains_arguments
@@ -26,6 +27,7 @@ from gpmpc.logs._time_step import find_time_step
 from gpmpc.logs._usable_rows import UNCHANGING, least_motion, select_rows
 
 MOST_UNLIKE_SPREAD = 30.0  # of two entries of one signal
+FEWEST_SHARED = 20  # rows: a few begin alike by chance
 LARGEST_ROUNDING = 1e-4  # of an input that is a state in other units
 
 
@@ -84,6 +86,8 @@ def read_log(
     _note_unlike_entries(runs, mapping, findings)
     _note_copied_states(runs, mapping, findings)
     _note_equal_runs(runs, findings)
+    _note_shared_rows(runs, findings)
+    _note_opposite_signs(runs, mapping, findings)
     if mapping.model == "rigid_body":
         runs, remarks = read_rigid_bodies(runs, step, mapping)
         findings += remarks
@@ -282,6 +286,60 @@ def _note_equal_runs(runs: Sequence[LogRun], findings: list[Finding]) -> None:
                 "leave one of them out"
             )
             findings.append(Finding("equal runs", run.name, len(run), text))
+
+
+def _note_shared_rows(runs: Sequence[LogRun], findings: list[Finding]) -> None:
+    """Notes runs of which a part is in an earlier one, as in files that overlap.
+
+    Rows are the same where their times and all values are.
+    """
+    keys = np.concatenate([_row_keys(run) for run in runs])
+    numbers = np.repeat(np.arange(len(runs)), [len(run) for run in runs])
+    _, first_rows, indices = np.unique(keys, return_index=True, return_inverse=True)
+    first_runs = numbers[first_rows][indices]
+    for number, run in enumerate(runs):
+        of_others = first_runs[(numbers == number) & (first_runs < number)]
+        if len(of_others) < FEWEST_SHARED or len(of_others) == len(run):
+            continue
+        other = runs[int(np.bincount(of_others).argmax())].name
+        text = (
+            f"{len(of_others)} of {len(run)} rows are in earlier runs, such as "
+            f"{other}: held out from these, they show nothing; leave them out of one"
+        )
+        findings.append(Finding("shared rows", run.name, len(of_others), text))
+
+
+def _row_keys(run: LogRun) -> np.ndarray:
+    """Returns numbers (K,) that are equal where the times and values of rows are."""
+    values = np.column_stack([run.time, run.states, run.inputs, run.context])
+    return pd.util.hash_pandas_object(pd.DataFrame(values), index=False).to_numpy()
+
+
+def _note_opposite_signs(
+    runs: Sequence[LogRun], mapping: LogMapping, findings: list[Finding]
+) -> None:
+    """Notes quaternions of both signs, where models take them as four numbers.
+
+    Signs are steady within a run. So a body that goes on turning has opposite numbers
+    for one attitude. The features of a rigid body do not depend on the sign.
+    """
+    if mapping.model == "rigid_body":
+        return
+    for signal, columns in zip(
+        mapping.of("states"), mapping.space.columns, strict=True
+    ):
+        if not signal.is_attitude:
+            continue
+        scalars = np.concatenate([run.states[:, columns.stop - 1] for run in runs])
+        count = int((scalars < 0).sum())
+        if not count:
+            continue
+        text = (
+            f"{signal.name} turns by more than half a turn: {count} of {len(scalars)} "
+            "rows have a negative scalar, and q and -q, which are one attitude, are "
+            "different numbers to a model other than model: rigid_body"
+        )
+        findings.append(Finding("opposite quaternions", runs[0].name, count, text))
 
 
 def _check_unchanging(runs: Sequence[LogRun], findings: Sequence[Finding]) -> None:

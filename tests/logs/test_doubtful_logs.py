@@ -348,3 +348,34 @@ def test_an_angle_that_is_no_state_and_jumps_by_a_turn_is_noted(tmp_path, role):
     log = read_log(written(tmp_path, table), {**MAPPING, role: signals})
     (text,) = texts(log, "turns")
     assert text.startswith("heading jumps by a turn 8 times, and is no state: models")
+
+
+def test_rows_that_two_files_share_are_noted(tmp_path):
+    table = table_of(600)
+    files = [
+        written(tmp_path, table[:400], "a.csv"),
+        written(tmp_path, table[350:], "b.csv"),
+        written(tmp_path, table.assign(x=1.1 * table["x"]), "c.csv"),
+    ]
+    log = read_log(files, MAPPING)
+    (finding,) = log.findings
+    assert (finding.kind, finding.run, finding.count) == ("shared rows", "b", 50)
+    assert finding.text.startswith(
+        "50 of 250 rows are in earlier runs, such as a: held"
+    )
+
+
+def test_an_attitude_that_turns_on_is_noted(tmp_path):
+    table = table_of()
+    for half_turns in (0.9, 1.5):
+        yaw = half_turns * np.pi * (1 - np.cos(np.pi * np.arange(300) / 300)) / 2
+        table[["qx", "qy"]] = 0.0
+        table["qz"] = np.sin(yaw / 2)
+        table["qw"] = np.cos(yaw / 2)
+        attitude = {"columns": ["qx", "qy", "qz", "qw"], "kind": "quaternion"}
+        log = read_log(
+            written(tmp_path, table), {**MAPPING, "states": {"attitude": attitude}}
+        )
+        noted = [one for one in log.findings if one.kind == "opposite quaternions"]
+        assert len(noted) == (half_turns > 1)
+        assert all(one.text.startswith("attitude turns by more than") for one in noted)
