@@ -3,6 +3,8 @@
     words -> choices among files | values of settings
     choices -> template, by Hydra -> copy -> values set -> settings of one run
 
+Words, overrides, choices and options are those of ``_overrides``.
+
 Hydra reads files and merges them for a tenth of a second, and what comes out depends
 on the values of settings only where they stand. So they are set afterwards, in the
 order and by the function that Hydra itself sets them with. Where an override does more
@@ -102,8 +104,9 @@ class Composer:
 
     Args:
         name: Of the file in ``conf/``.
-        first: Settings of some run, composed. What a resolver that is called once has
-            said there, such as the time, it says everywhere.
+        first: Settings of some run, composed, whose cache of resolvers all others
+            get: what one that is called once has said there, such as the time, it says
+            everywhere.
     """
 
     def __init__(self, name: str, first: DictConfig):

@@ -1,6 +1,6 @@
 """Makes the objects of a flight from its settings.
 
-    settings -> checked -> merged, each part as it will be called -> Experiment
+    settings -> checked -> completed, each part as it will be called -> Experiment
 
 Those that a user gives may call anything; those out of a file are checked first.
 """
@@ -49,7 +49,7 @@ def experiment_of(config: DictConfig) -> Experiment:
     What is flown is tracked: what a file describes is not.
     """
     check_tracker(config.get("tracker"))
-    return _build(_merge(DictConfig(plain_data(config))))
+    return _build(_completed(DictConfig(plain_data(config))))
 
 
 def experiment_of_file(settings: dict[str, Any], trusted: Sequence[str]) -> Experiment:
@@ -62,12 +62,15 @@ def experiment_of_file(settings: dict[str, Any], trusted: Sequence[str]) -> Expe
     Raises:
         DataError: They call something else.
     """
-    merged = plain_data(_merge(DictConfig(settings)))
-    return _build(DictConfig(checked_settings(merged, trusted)))
+    completed = plain_data(_completed(DictConfig(settings)))
+    return _build(DictConfig(checked_settings(completed, trusted)))
 
 
-def _merge(config: DictConfig) -> DictConfig:
-    """Checks settings and completes their parts, each as it will be called."""
+def _completed(config: DictConfig) -> DictConfig:
+    """Checks settings and completes their parts, each as it will be called.
+
+    Nothing that they name is imported or called before ``_build``.
+    """
     _check(config)
     _complete_systems(config)
     _choose_parts(config)
@@ -113,7 +116,7 @@ def _choose_parts(config: DictConfig) -> None:
 
 
 def _build(config: DictConfig) -> Experiment:
-    """Makes the objects of merged settings."""
+    """Makes the objects of completed settings."""
     system = _system_of(config.system)
     if config.nominal:
         system = replace(system, nominal=_system_of(config.nominal))

@@ -108,9 +108,11 @@ class Launcher(Protocol):
         ...
 
     def call(self, function: Work, argument: Any) -> None:
-        """Calls a function that needs what flies, where that is loaded anyway.
+        """Calls a function that needs what flies, such as torch.
 
-        Its exceptions come back as they are.
+        A launcher whose processes wait for runs on this machine calls it in one of
+        them, so that nothing is loaded here; the others call it here. Its exceptions
+        come back as they are.
         """
         ...
 

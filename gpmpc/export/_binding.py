@@ -132,8 +132,8 @@ class CompiledLibrary:
         """
         followed = reference.over(self._horizon)
         check_kappas(followed)
-        rows = self._horizon + 1
-        _check_numbers("a reference", followed.states, (rows, self._states))
+        stages = self._horizon + 1
+        _check_numbers("a reference", followed.states, (stages, self._states))
         converted = self._reference_type()
         if self._parameters:
             rows = parameter_rows(parameters, self._horizon, self._parameters)

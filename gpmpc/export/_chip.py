@@ -91,7 +91,7 @@ class Footprint:
 
     @property
     def memory(self) -> int:
-        """RAM, and the stack where it is known [B]."""
+        """What ``ram`` of a budget limits: RAM, and the stack if it is known [B]."""
         return self.ram + (self.stack or 0)
 
     @property

@@ -286,7 +286,10 @@ class _Search:
         return fits
 
     def _fits(self, count: int, replays: bool = True) -> bool:
-        """Returns whether the code of so many points is within the budget."""
+        """Returns whether the code of so many points is within the budget.
+
+        A number that was found without a replay is compiled again for its row.
+        """
         return not self._budget.excesses(self._footprint(count, replays))
 
     def _footprint(self, count: int, replays: bool = True) -> Footprint:

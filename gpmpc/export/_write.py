@@ -236,7 +236,7 @@ def _texts(
         functions.text,
     ]
     texts = {
-        "model": "\n".join(generated),
+        "generated": "\n".join(generated),
         "pairs": _part("pairs.c"),
         "exact": _part("exact.c"),
         "qp": _part("qp.c").replace("/*{rescue}*/", _part("rescue.c")),

@@ -189,7 +189,7 @@ static int solve_positive(real *A, int size, real *X, int columns)
 
 /*{pairs}*/
 
-/*{model}*/
+/*{generated}*/
 
 /* ------------------------------------------------------------------------------------
    The local problem: the plan that a step starts from, and its stages.

@@ -124,6 +124,8 @@ class RunFolder:
     def outcome_since(self, failed_before: int | None) -> RunState | None:
         """Returns FINISHED or FAILED; None where the run has not ended.
 
+        A failure of the same moment is the same failure.
+
         Args:
             failed_before: When an attempt failed that does not count [ns]; None where
                 every one does.
