@@ -97,18 +97,26 @@ class Judgement:
     def losses_to(self, baselines: Sequence[str]) -> tuple[str, ...]:
         """Returns sentences on the errors that are larger than those of some baselines.
 
+        Baselines that are the same predictor, as a constant state and a constant
+        velocity where no velocity is known, have one sentence.
+
         Args:
             baselines: Their names.
         """
         losses = []
+        names = [one.name for one in self.comparisons if one.name in baselines]
         for one in self.comparisons:
-            if one.name not in baselines:
+            if one.name not in names:
                 continue
             for k, g in np.argwhere((one.ratio > LOSING_RATIO) & (one.low > 1.0)):
+                error = self.mean[one.name][k, g]
+                equal = [name for name in names if self.mean[name][k, g] == error]
+                if equal[0] != one.name:
+                    continue
                 losses.append(
                     f"{self.groups[g]} {self.steps[k]} steps ahead: "
                     f"{self.mean[MODEL][k, g]:.3g} {self.units[g]}, "
-                    f"{one.name} {self.mean[one.name][k, g]:.3g} "
+                    f"{' and '.join(equal)} {error:.3g} "
                     f"({one.ratio[k, g]:.2f} of it; "
                     f"{one.low[k, g]:.2f} to {one.high[k, g]:.2f})"
                 )

@@ -25,7 +25,8 @@ from gpmpc.models._log_dynamics import TIME_CONSTANTS, OutputNoise
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._windows import Windows
 
-_STEPS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # whose errors are explained
+_STEPS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # whose errors are explained,
+_FAR_STEPS = (70, 100, 150, 200, 300, 500)  # and of longer rollouts; the last step too
 _WINDOWS = 2000  # of all folds, whose errors count
 _COMPARED = 250  # of a log, on which models of more and of fewer rows are compared
 _LINEARIZED = 400  # of all folds, along which rollouts are linearised: these are slow
@@ -138,6 +139,8 @@ def fit_noise(
         longest: Steps of the rollouts.
     """
     steps = [step for step in _STEPS if step <= longest]
+    if longest > _STEPS[-1]:
+        steps += [*(step for step in _FAR_STEPS if step < longest), longest]
     linearized = _LINEARIZED if models[0].memory.empty else _LINEARIZED_WITH_MEMORY
     folds = [
         _fold_errors(

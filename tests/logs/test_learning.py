@@ -261,6 +261,9 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
     nothing = replace(wrong.model, theta=np.full_like(wrong.model.theta, np.nan))
     judgement = judge(replace(wrong, model=nothing), held_out, train, steps=(1, 10))
     assert any("constant velocity" in loss for loss in judgement.losses)
+    # Where no velocity is known both are one predictor, and one loss.
+    cells = [loss.split(":")[0] for loss in judgement.losses if "constant" in loss]
+    assert len(cells) == len(set(cells)) == 4
     # Two predictions of ten steps tell nothing, and twenty of one step do.
     rows = held_out.runs[0].part(0, needed + 28, "few")
     few = judge(wrong, replace(held_out, runs=(rows,)), train, steps=(1, 10))

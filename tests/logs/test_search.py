@@ -19,7 +19,7 @@ from gpmpc.logs._folds import split_folds
 from gpmpc.logs._judging import _coverage_intervals
 from gpmpc.logs._learning import _plan_folds
 from gpmpc.logs._log import LogRun
-from gpmpc.logs._noise import _nonnegative_solution, learning_gains
+from gpmpc.logs._noise import _nonnegative_solution, fit_noise, learning_gains
 from gpmpc.logs._ranges import ranges_of
 from gpmpc.logs._rollout_corrections import (
     _PRIORS,
@@ -548,6 +548,18 @@ def test_intervals_of_a_coverage_hold_where_errors_are_alike_for_long():
     assert np.mean(held) >= 0.92
     white = rng.normal(size=len(windows))
     assert effective_number(white, windows.runs) > 0.8 * len(white)
+
+
+def test_noise_is_known_as_far_as_rollouts_reach():
+    walk = np.cumsum(np.random.default_rng(0).normal(size=(2, 800, 2)), axis=1)
+    log = log_of(walk, np.zeros((2, 800, 1)))
+    kinematics = Increments(log.space)
+    still = AffineNominal(kinematics, fitted=False)
+    model = LogModel(kinematics, still, np.empty(0), history=(0, 0))
+    noise = fit_noise([model], [log], longest=120)
+    assert noise.steps[-4:] == (50, 70, 100, 120)
+    largest = noise.largest_at((50, 120))
+    assert (largest[1] > 1.5 * largest[0]).all()
 
 
 def test_noise_is_fitted_to_what_is_finite():
