@@ -47,12 +47,19 @@ doubt in its turn. A wrong measurement may fall together with a change: so the c
 another plant is also sought over the steps in doubt, as if it began with the first or
 the last of them, and one that has been found is given a second step to be confirmed in.
 
-The controller does not act on a measurement in doubt: it plans from where the model
-expects the plant, with the covariance of that, for two steps at most. After them it
-acts on what is measured, with the model as it was learned, until that is explained.
+Sensors are wrong one by one. Those that show what is expected are trusted, and the
+others are in doubt; where other sensors are in doubt than a step before, another doubt
+has begun. A measurement that only one sensor's word stands for is believed a step
+later than one that several agree on.
+
+The controller does not act on a sensor in doubt: it plans from where the model expects
+the plant, given the trusted sensors, with the covariance of that, for two steps at
+most. After them it acts on what is measured, with the model as it was learned, until
+that is explained.
 Where several outputs err in the proportion in which an input acts on them, no single
 sensor is wrong: such a measurement is acted on, and the change that it shows is tried
-until it is confirmed, or given up. Steps in doubt may else end the use of a change, and
+until it is confirmed, or given up; so is one that then explains all outputs but one.
+Steps in doubt may else end the use of a change, and
 never begin it.
 
 ``_step`` holds this procedure, ``_changed_model`` the model f + B d, ``_state`` what

@@ -102,9 +102,15 @@ class LearningController:
         return replace(decision, timing=timing, learned=learned)
 
     def gains(self, decision: Decision, parameters: Any = None) -> Array:
-        """Returns those of the controller, by the model that made the decision."""
-        controller = self._with_change(decision.learned)
-        return controller.gains(decision, parameters)
+        """Returns those of the controller, by the model that made the decision.
+
+        Sensors in doubt have none until the next decision.
+        """
+        learned = decision.learned
+        gains = self._with_change(learned).gains(decision, parameters)
+        if learned is None:
+            return gains
+        return np.where(learned.sensors_in_doubt, 0.0, gains)
 
     def _with_change(self, learned: LearningState | None) -> GPMPC:
         """Returns the controller with the model that plans after a measurement."""

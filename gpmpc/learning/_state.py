@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gpmpc._angles import state_difference
 from gpmpc._dynamics import Array, DynamicsModel, linearize
@@ -30,6 +31,31 @@ class Expectation(NamedTuple):
             covariance=np.zeros((n, n)),
             by_input=np.zeros((n, change.model.input_dim)),
             by_change=np.zeros((n, change.gp.output_dim)),
+        )
+
+    def given(
+        self, state: Array, trusted: NDArray[np.bool_], change: ChangedModel
+    ) -> "Expectation":
+        """Returns the expectation where some sensors are known to be right.
+
+        Args:
+            state: Measured (n,).
+            trusted: Whether a sensor is right (n,).
+            change: Knows which states are angles.
+        """
+        error = state_difference(state, self.mean, change.angles)
+        of_trusted = self.covariance[:, trusted]
+        gain = of_trusted @ np.linalg.pinv(of_trusted[trusted], hermitian=True)
+        gain[trusted] = np.eye(int(np.count_nonzero(trusted)))
+        left = np.eye(len(error))
+        left[:, trusted] -= gain
+        mean = self.mean + gain @ error[trusted]
+        mean[trusted] = state[trusted]
+        return Expectation(
+            mean=mean,
+            covariance=left @ self.covariance @ left.T,
+            by_input=left @ self.by_input,
+            by_change=left @ self.by_change,
         )
 
     def after(
@@ -77,7 +103,9 @@ class NewPlant(NamedTuple):
 class Doubt(NamedTuple):
     """A measurement that is held back until the next one explains it."""
 
-    expected: Expectation  #: where the plant is if all measurements in doubt are wrong
+    #: where the plant is if the sensors in doubt are wrong, and the others are not
+    expected: Expectation
+    trusted: NDArray[np.bool_]  #: sensors that show what is expected (n,)
     #: ``noise_ratios`` of the ``LearningState`` before the steps in doubt (w,)
     trusted_noise_ratios: Array
     #: those that the next step may confirm; none where the steps teach nothing
@@ -178,6 +206,11 @@ class LearningState:
     def planned_state(self) -> Array:
         """The state that is planned from (n,)."""
         return self.state if self.assumed is None else self.assumed.mean
+
+    @property
+    def sensors_in_doubt(self) -> NDArray[np.bool_]:
+        """Which sensors (n,) show another state than is planned from."""
+        return self.planned_state != self.state
 
     @property
     def _tries_new_plant(self) -> bool:

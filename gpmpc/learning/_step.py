@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from gpmpc._angles import state_difference
@@ -121,7 +122,9 @@ def _accept(seen: LearningState, comparison: Comparison) -> LearningState:
     """Makes a step a point of the change, and decides whether the change is used."""
     unexplained_steps = max(0, seen.unexplained_steps - 1)
     learned = replace(
-        seen, model=comparison.model_with_step, unexplained_steps=unexplained_steps
+        seen,
+        model=comparison.model_with_step,
+        unexplained_steps=unexplained_steps,
     )
     return _count_lead(learned, comparison.lead)
 
@@ -147,6 +150,7 @@ def _put_in_doubt(
     comparison: Comparison,
     expected_if_wrong: Expectation,
     trusted_noise_ratios: Array,
+    bounded_density_to_beat: float = 0.0,
 ) -> LearningState:
     """Holds a measurement back that no prediction explains.
 
@@ -156,36 +160,55 @@ def _put_in_doubt(
         comparison: Of the predictions of the step.
         expected_if_wrong: Where the plant is if all measurements in doubt are wrong.
         trusted_noise_ratios: Those before the steps in doubt.
+        bounded_density_to_beat: Of a plant that the measurement before has put forward.
     """
+    trusted = _trusted_sensors(step, expected_if_wrong, seen.model)
     previous_doubt = seen.doubt  # that the measurement did not resolve
+    unexplained_steps = seen.unexplained_steps
+    steps_in_doubt = 1
+    starts = [Expectation.certain(step.state, seen.model)]
+    continued_plants: tuple[NewPlant, ...] = ()
     if previous_doubt is None:
-        unexplained_steps = seen.unexplained_steps
-        steps_in_doubt = 1
+        pass
+    elif (trusted | previous_doubt.trusted).all():
+        # The sensors that were wrong are right again: they were for one step.
+        seen = seen.without_doubt(previous_doubt)
+        starts = [_begun_now(previous_doubt.expected)]
     else:
         unexplained_steps = min(seen.unexplained_steps + 1, _PATIENCE)
         steps_in_doubt = previous_doubt.steps_in_doubt + 1
-
-    new_plants: tuple[NewPlant, ...] = ()
-    if not _is_frozen(seen, step, expected_if_wrong):
-        starts = [Expectation.certain(step.state, seen.model)]
-        if previous_doubt is not None and previous_doubt.bridged:
+        continued_plants = _without_last_measurement(
+            previous_doubt.new_plants, step, bounded_density_to_beat
+        )
+        if previous_doubt.bridged:
             # The change begins with this step, or it began with the first in doubt.
             starts.append(_begun_now(previous_doubt.expected))
             starts.append(previous_doubt.expected)
-        new_plants = tuple(
-            _new_plant(seen, step, start, unexplained_steps, steps_in_doubt)
-            for start in starts
-        )
-        if previous_doubt is not None:
-            new_plants += _without_last_measurement(previous_doubt.new_plants, step)
-    bridged = steps_in_doubt <= _LONGEST_BRIDGE and not _acts_like_input(
+
+    acts_like_input = _acts_like_input(
         innovation=seen.innovation(expected_if_wrong),
         by_input=seen.model.B_inverse @ expected_if_wrong.by_input,
         notable=_NOTABLE,
         deviations=_DEVIATIONS,
     )
+    bridged = steps_in_doubt <= _LONGEST_BRIDGE and not acts_like_input
+    new_plants: tuple[NewPlant, ...] = ()
+    if not _is_frozen(seen, step, expected_if_wrong):
+        new_plants = tuple(
+            _new_plant(
+                seen,
+                step,
+                start,
+                unexplained_steps,
+                steps_in_doubt,
+                may_be_tried=acts_like_input,
+            )
+            for start in starts
+        )
+        new_plants += continued_plants
     doubt = Doubt(
-        expected=expected_if_wrong,
+        expected=expected_if_wrong.given(seen.state, trusted, seen.model),
+        trusted=trusted,
         trusted_noise_ratios=trusted_noise_ratios,
         new_plants=new_plants,
         steps_in_doubt=steps_in_doubt,
@@ -208,17 +231,46 @@ def _begun_now(start: Expectation) -> Expectation:
 
 
 def _without_last_measurement(
-    plants: tuple[NewPlant, ...], step: LearningStep
+    plants: tuple[NewPlant, ...],
+    step: LearningStep,
+    density_to_beat: float,
 ) -> tuple[NewPlant, ...]:
     """Returns new plants of which the last measurement, of a step, was wrong.
 
-    Those of which the one before was wrong already are given up.
+    A plant that explains all outputs but one, and more than anything else does, is
+    tried: one sensor is wrong. The others are given up if the measurement before was
+    wrong already.
+
+    Args:
+        plants: Put forward by the measurement before.
+        step: The step that none of them explains.
+        density_to_beat: Bounded log density that the one of a plant has to exceed.
     """
-    return tuple(
-        plant._replace(model=plant.model.later(1.0), expected=plant.after(step))
-        for plant in plants
-        if plant.expected is None
-    )
+    kept = []
+    for plant in plants:
+        surprise = plant.model.learning.surprise
+        expected = plant.after(step)
+        innovation = _innovation_of(plant, step, expected)
+        explained = int(np.count_nonzero(innovation.squares <= surprise))
+        several_explained = 1 < explained == len(innovation.error) - 1
+        density = innovation.bounded_log_density(surprise)
+        is_tried = several_explained and density > density_to_beat
+        if plant.expected is not None and not is_tried:
+            continue
+        confirmations_left = plant.confirmations_left
+        if is_tried:
+            confirmations_left = max(1, confirmations_left - 1)
+            trusted = _trusted_sensors(step, expected, plant.model)
+            expected = expected.given(step.next_state, trusted, plant.model)
+        kept.append(
+            plant._replace(
+                model=plant.model.later(1.0),
+                expected=expected,
+                confirmations_left=confirmations_left,
+                tried=is_tried,
+            )
+        )
+    return tuple(kept)
 
 
 def _new_plant(
@@ -227,6 +279,7 @@ def _new_plant(
     start: Expectation,
     unexplained_steps: int,
     steps_in_doubt: int,
+    may_be_tried: bool,
 ) -> NewPlant:
     """Returns the plant whose change explains a measurement.
 
@@ -236,6 +289,7 @@ def _new_plant(
         start: Where the plant was before; ``by_change`` says since when it is changed.
         unexplained_steps: Each asks for a further confirmation.
         steps_in_doubt: This one included.
+        may_be_tried: Whether several sensors err together, from what is trusted.
     """
     model = seen.model.without_points()
     surprise = model.learning.surprise
@@ -254,7 +308,7 @@ def _new_plant(
     further = comparison.with_change.largest_square / surprise
     confirmations = 1 + unexplained_steps + int(min(further, _MOST_CONFIRMATIONS))
     tried = False
-    if confirmations <= steps_in_doubt <= _LONGEST_BRIDGE:
+    if may_be_tried and confirmations <= steps_in_doubt <= _LONGEST_BRIDGE:
         planned = seen.expect(start, step)
         tried = _acts_like_input(
             innovation=seen.innovation(planned),
@@ -267,6 +321,15 @@ def _new_plant(
         confirmations_left=confirmations,
         tried=tried,
     )
+
+
+def _trusted_sensors(
+    step: LearningStep, expected: Expectation, model: ChangedModel
+) -> NDArray[np.bool_]:
+    """Returns which sensors (n,) move in a step, and show what is expected."""
+    error = state_difference(step.next_state, expected.mean, model.angles)
+    threshold = model.learning.surprise * np.diagonal(expected.covariance)
+    return (error**2 <= threshold) & ~step.repeats
 
 
 def _is_frozen(seen: LearningState, step: LearningStep, expected: Expectation) -> bool:
@@ -317,21 +380,59 @@ def _resolve_doubt(
     confirmed = tuple(plant for plant in plants if plant is not None)
     for plant in confirmed:
         if plant.confirmations_left == 0:
-            return _switch_plant(seen, plant.model)
+            return _switch_plant(seen.without_doubt(doubt), plant.model)
     if confirmed:
+        trusted = _trusted_sensors(step, expected_if_wrong, seen.model)
         still = Doubt(
-            expected=expected_if_wrong,
+            expected=expected_if_wrong.given(seen.state, trusted, seen.model),
+            trusted=trusted,
             trusted_noise_ratios=doubt.trusted_noise_ratios,
             new_plants=tuple(p._replace(model=p.model.later(1.0)) for p in confirmed),
             steps_in_doubt=doubt.steps_in_doubt + 1,
         )
         confirmed_once = replace(seen, doubt=still, version=seen.version + 1)
         return _count_doubtful_lead(confirmed_once, comparison.lead)
-    if min(if_moved.largest_square, if_wrong.largest_square) <= settings.surprise:
+    if if_wrong.largest_square <= settings.surprise:
         return _count_doubtful_lead(seen.without_doubt(doubt), comparison.lead)
-    return _put_in_doubt(
-        seen, step, comparison, expected_if_wrong, doubt.trusted_noise_ratios
+    if if_moved.largest_square <= settings.surprise:
+        # A plant that moves is seen by several sensors; one alone may be wrong twice.
+        alone = np.count_nonzero(if_wrong.squares > settings.surprise) == 1
+        if alone and doubt.bridged and doubt.steps_in_doubt < _LONGEST_BRIDGE:
+            after = _bridge_again(seen, step, doubt, expected_if_wrong)
+        else:
+            after = seen.without_doubt(doubt)
+        return _count_doubtful_lead(after, comparison.lead)
+    bounded_density = max(
+        if_wrong.bounded_log_density(settings.surprise),
+        if_moved.bounded_log_density(settings.surprise),
     )
+    return _put_in_doubt(
+        seen,
+        step,
+        comparison,
+        expected_if_wrong,
+        doubt.trusted_noise_ratios,
+        bounded_density_to_beat=bounded_density + LARGEST_LEAD,
+    )
+
+
+def _bridge_again(
+    seen: LearningState,
+    step: LearningStep,
+    doubt: Doubt,
+    expected_if_wrong: Expectation,
+) -> LearningState:
+    """Does not act on a measurement, either, that follows from the one in doubt."""
+    trusted = _trusted_sensors(step, expected_if_wrong, seen.model)
+    bridged = Doubt(
+        expected=expected_if_wrong.given(seen.state, trusted, seen.model),
+        trusted=trusted,
+        trusted_noise_ratios=doubt.trusted_noise_ratios,
+        new_plants=(),
+        steps_in_doubt=doubt.steps_in_doubt + 1,
+        bridged=True,
+    )
+    return replace(seen, doubt=bridged)
 
 
 def _resolve_outside_model(
@@ -368,8 +469,10 @@ def _resolve_outside_model(
         notable=_NOTABLE,
         deviations=_DEVIATIONS,
     )
+    trusted = _trusted_sensors(step, expected, model)
     still = Doubt(
-        expected=expected,
+        expected=expected.given(measured, trusted, model),
+        trusted=trusted,
         trusted_noise_ratios=doubt.trusted_noise_ratios,
         new_plants=(),
         steps_in_doubt=steps_in_doubt,
@@ -397,17 +500,26 @@ def _confirmed(
         innovation = comparison.with_change
         model = comparison.model_with_step
     else:
-        expected = plant.after(step)
-        error = state_difference(step.next_state, expected.mean, model.angles)
-        innovation = Innovation(
-            error=model.B_inverse @ error,
-            variance=model.explainable_variance(expected.covariance),
-        )
+        innovation = _innovation_of(plant, step, plant.after(step))
     explained = innovation.largest_square <= model.learning.surprise
     if not (explained and innovation.log_density > density_to_beat):
         return None
     return plant._replace(
-        model=model, expected=None, confirmations_left=plant.confirmations_left - 1
+        model=model,
+        expected=None,
+        confirmations_left=plant.confirmations_left - 1,
+    )
+
+
+def _innovation_of(
+    plant: NewPlant, step: LearningStep, expected: Expectation
+) -> Innovation:
+    """Computes the innovation of a step that a new plant predicts."""
+    model = plant.model
+    error = state_difference(step.next_state, expected.mean, model.angles)
+    return Innovation(
+        error=model.B_inverse @ error,
+        variance=model.explainable_variance(expected.covariance),
     )
 
 

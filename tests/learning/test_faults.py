@@ -169,14 +169,25 @@ def test_the_wind_is_learned_between_wrong_measurements(fault):
 def test_a_measurement_in_doubt_is_not_acted_on():
     sensor = Sensor()
     sensor.offset[60] = [0.5, 0.0]
-    sensor.offset[90:92] = [[-0.5, 0.0], [0.0, 2.0]]
+    sensor.offset[90:93] = [[-0.5, 0.0], [0.0, 2.0], [-0.5, 0.0]]
     errors, decisions = flown(OnlineLearning(), lambda random: sensor)
     assert np.abs(errors[50:]).max() < 0.02
-    for k in (60, 90, 91):
-        expected = decisions[k].learned.doubt.expected
+    for k in (60, 90, 91, 92):
+        learned = decisions[k].learned
+        expected = learned.doubt.expected
+        is_wrong = sensor.offset[k] != 0.0
+        assert np.array_equal(expected.mean == learned.state, ~is_wrong)
+        assert np.array_equal(np.diagonal(expected.covariance) == 0.0, ~is_wrong)
         assert np.array_equal(decisions[k].means[0], expected.mean)
         assert np.array_equal(decisions[k].covariances[0], expected.covariance)
     assert decisions[61].learned.doubt is None
+
+
+def test_a_sensor_that_is_wrong_twice_in_the_same_way_moves_no_plant():
+    sensor = Sensor()
+    sensor.offset[60:62, 0] = 0.5
+    errors, _ = flown(OnlineLearning(), lambda random: sensor)
+    assert np.abs(errors[50:]).max() < 0.03
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -276,6 +287,8 @@ def test_both_transitions_of_a_changed_plant_are_learned():
     assert not steps[first].active
     assert steps[first + 1].active
     assert len(steps[first + 1].model) == 2
+    trusted_noise_ratios = steps[first - 1].noise_ratios
+    assert np.array_equal(steps[first + 1].noise_ratios, trusted_noise_ratios)
     assert all(one.active for one in steps[first + 1 :])
 
 
@@ -498,6 +511,19 @@ def test_feedback_between_plans_is_that_of_the_controller():
         inputs.append(loop.input_between([0.05, 0.0], 0.5))
     assert inputs[0] == inputs[1]
     assert inputs[0] != loop.input_between([0.06, 0.0], 0.5)
+
+
+def test_feedback_between_plans_is_not_that_of_a_sensor_in_doubt():
+    states, _ = excited(8)
+    loop = ControlLoop(controller_of(OnlineLearning()))
+    for state in states[:7]:
+        loop.input(state, np.zeros(2))
+    doubted = loop.last.decision.means[1] + [0.5, 0.0]
+    loop.input(doubted, np.zeros(2))
+    assert loop.last.decision.learned.sensors_in_doubt.tolist() == [True, False]
+    between = loop.input_between(doubted, 0.0)
+    assert between == pytest.approx(loop.last.decision.input)
+    assert between != loop.input_between(np.add(doubted, [0.0, 0.1]), 0.0)
 
 
 def test_a_first_plan_is_handed_on():
