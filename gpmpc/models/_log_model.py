@@ -31,7 +31,9 @@ from gpmpc.models._roll_out import iterate
 from gpmpc.models._windows import Windows
 
 DIVERGED = 1e9  # error of a rollout that is not finite
-LAG_FILL_ROWS = 40  # from which the state of first-order lags is known
+# Over which the state of first-order lags is found: lags begin at the first input of
+# the window, and of a time constant of T rows exp(-40 / T) of that error is left.
+LAG_FILL_ROWS = 40
 
 
 @dataclass(frozen=True, eq=False)
