@@ -292,6 +292,34 @@ def test_both_transitions_of_a_changed_plant_are_learned():
     assert all(one.active for one in steps[first + 1 :])
 
 
+def two_carts(state, inputs, wind=0.0):
+    one = cart(state[:2], inputs[:1], wind=wind)
+    other = cart(state[2:], inputs[1:], wind=-wind)
+    return np.concatenate([one, other])
+
+
+def test_a_new_plant_that_explains_all_sensors_but_one_is_tried():
+    random = np.random.default_rng(0)
+    noise = np.tile(NOISE, 2)
+    inputs = random.uniform(-3, 3, (120, 2))
+    states = [np.zeros(4)]
+    for k, input in enumerate(inputs):
+        state = two_carts(states[-1], input, wind=0.8 if k >= 110 else 0.0)
+        states.append(state + random.normal(0, noise))
+    data = Transitions(states[:90], inputs[:90], states[1:91])
+    model = Trainer(predicts="difference", restarts=0)(data).posterior
+    states[112][0] += 0.5
+    begin = LearningState.begin(ChangedModel(model), states[90])
+    steps = taught(states[90:], inputs[90:], begin)
+    assert steps[20].doubt is not None
+    tried = steps[21]
+    assert tried.planning is tried.doubt.tried_plant.model
+    assert tried.sensors_in_doubt.tolist() == [True, False, False, False]
+    assert tried.planned_state[0] == pytest.approx(states[112][0] - 0.5, abs=0.05)
+    assert steps[22].active
+    assert steps[22].doubt is None
+
+
 def test_a_change_that_acts_like_an_input_is_used_at_once():
     states, inputs = excited(20)
     learned = taught(states, inputs)[-1]
