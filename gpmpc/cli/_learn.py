@@ -33,6 +33,7 @@ from gpmpc.logs._judging import (
 )
 from gpmpc.logs._learning import fewest_rows
 from gpmpc.logs._log import LogRun
+from gpmpc.logs._structures import affordable_rows_back, past_rows_needed
 from gpmpc.plotting import judgement_figure, png
 from gpmpc.studies._document import Document, Table, number, terminal
 from gpmpc.studies._run_folder import describe_code
@@ -75,6 +76,9 @@ def learn(arguments: argparse.Namespace) -> Result:
     train = split.train
     check_train(train)
     check_held_out(split.held_out(PAST))
+    doubt = _doubt_of_held_out(split, arguments.for_control)
+    if doubt:
+        console.print(doubt)
     with writing(folder, "to"):
         folder.mkdir(parents=True, exist_ok=True)
         learned, judgement = _learn_and_judge(
@@ -281,6 +285,18 @@ def _split(log: Log, held_out: Sequence[str]) -> _Split:
 def _longest_piece(run: LogRun) -> int:
     """Returns the number of rows of a run's longest piece."""
     return max(end - begin for begin, end in run.pieces)
+
+
+def _doubt_of_held_out(split: _Split, for_control: bool) -> str:
+    """Says, before hours of learning, that a model may not be judged afterwards."""
+    most = past_rows_needed(affordable_rows_back(split.train, for_control))
+    longest = split.held_out(most).longest_piece
+    if longest >= most + 2:
+        return ""
+    return (
+        f"the longest piece that is held out has {longest} rows: a model may look back "
+        f"on {most}, and could not be judged on it; hold out longer runs"
+    )
 
 
 class _StageResults(dict[str, Any]):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from gpmpc.cli._learn import _doubt_of_held_out, _Split
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gp import train
 from gpmpc.logs import Judgement, Log, LogMapping, fit_nominal, judge, learn
@@ -548,6 +549,16 @@ def test_intervals_of_a_coverage_hold_where_errors_are_alike_for_long():
     assert np.mean(held) >= 0.92
     white = rng.normal(size=len(windows))
     assert effective_number(white, windows.runs) > 0.8 * len(white)
+
+
+def test_held_out_runs_too_short_for_some_models_are_told_before_learning():
+    train = log_of(np.zeros((1, 900, 2)), np.zeros((1, 900, 1)))
+    for rows, is_told in ((30, True), (200, False)):
+        held_out = log_of(np.zeros((1, rows, 2)), np.zeros((1, rows, 1)))
+        doubt = _doubt_of_held_out(_Split(train, held_out), for_control=False)
+        assert (f"has {rows} rows" in doubt) == is_told
+    whole = _Split(train, held_out, train.runs[0])  # its last rows have a past
+    assert not _doubt_of_held_out(whole, for_control=False)
 
 
 def test_noise_is_known_as_far_as_rollouts_reach():
