@@ -267,7 +267,8 @@ class AdaptiveTube:
         # So states and plans are moved by whole turns to where this state, the last
         # value of each entry, goes on without jumps; NaN before the first.
         self._last_state = np.full(n, np.nan)
-        self._compare(np.full(n, np.nan))  # nothing yet: kappas alone
+        # Nothing yet: kappas alone, from the scores.
+        self._compare(np.full(n, np.nan))
 
     def observe(self, state: Any) -> Array:
         """Compares a state (n,) with the plans before it; returns kappas (H,).
@@ -319,13 +320,12 @@ class AdaptiveTube:
         r, n = self.tube.rows.shape
         means = _of_shape("means", means, (H + 1, n))
         covariances = _of_shape("covariances", covariances, (H + 1, n, n))
-        counts = np.full((H, r), True)
+        counted_directions = np.full((H, r), True)
         if stages is not None:
-            counts = np.array(stages, dtype=bool)
-            if counts.shape not in ((H,), (H, r)):
-                raise ShapeError(
-                    f"stages must be ({H},) or {(H, r)}; got {counts.shape}"
-                )
+            counted_directions = np.array(stages, dtype=bool)
+            shape = counted_directions.shape
+            if shape not in ((H,), (H, r)):
+                raise ShapeError(f"stages must be ({H},) or {(H, r)}; got {shape}")
         turns = full_turns(self._last_state - means[0], self.tube.angles)
         means = means + np.nan_to_num(turns)
         bounds = self._bounds[self._step % H]
@@ -337,7 +337,7 @@ class AdaptiveTube:
             self.kappas,
             bounds,
         )
-        bounds[~counts] = np.nan
+        bounds[~counted_directions] = np.nan
 
     def _without_jumps(self, state: Array) -> Array:
         """Moves the angles of a state (n,) to within half a turn of the last ones.
@@ -459,10 +459,12 @@ def _observe(state, rows, bounds, step, adaptation, scores, stages):
                 if rows[r, i] != 0.0:  # a state that was not measured is NaN
                     value += rows[r, i] * state[i]
             bound = bounds[plan, k, r]
-            counts = bound == bound
-            any_bound_counts = any_bound_counts or counts
-            is_measured = is_measured and (not counts or value == value)
+            is_counted = bound == bound
+            any_bound_counts = any_bound_counts or is_counted
+            is_measured = is_measured and (not is_counted or value == value)
             is_violated = is_violated or value > bound
+        # A stage that is not measured as a whole is left out, held or not: with only
+        # the misses that are seen the share would be another.
         if any_bound_counts and is_measured:
             miss = 1.0 if is_violated else 0.0
             stages.counts[k] += 1.0

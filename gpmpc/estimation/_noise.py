@@ -400,10 +400,10 @@ def _rows_and_points(trained: "_TrainedGP", errors: Tensor) -> Tensor:
     gp = trained.gp
     inverse = torch.linalg.pinv(trained.effect)
     deviations = trained.noise.sqrt()
-    of_rows = to_array((inverse @ errors[..., None])[..., 0] / deviations)
+    row_errors = to_array((inverse @ errors[..., None])[..., 0] / deviations)
     # B^+ B / sd (N, k, k): a row with effect B shows no more of a point's errors.
     visible = to_array(inverse @ trained.effect / deviations[:, None])
-    of_points = to_array(trained.errors_of_points)
+    point_errors = to_array(trained.errors_of_points)
     scale = gp.features.abs().amax(dim=0).clamp_min(_SMALLEST_SCALE)
     points_at = defaultdict(list)
     for point, features in enumerate(_rounded(gp.features / scale)):
@@ -413,8 +413,8 @@ def _rows_and_points(trained: "_TrainedGP", errors: Tensor) -> Tensor:
         candidates = points_at[tuple(features)]
         if not candidates:
             continue
-        of_candidates = of_points[candidates] @ visible[row].T
-        distances = np.abs(of_candidates - of_rows[row]).max(axis=1)
+        candidate_errors = point_errors[candidates] @ visible[row].T
+        distances = np.abs(candidate_errors - row_errors[row]).max(axis=1)
         nearest = int(distances.argmin())
         if distances[nearest] <= _SAME_TARGET:
             pairs.append((row, candidates.pop(nearest)))
@@ -673,6 +673,8 @@ def _working_responses(g: Tensor, squares: Tensor, latent: Tensor) -> Tensor:
 
 def _prior_penalty(theta: np.ndarray, log_std: np.ndarray) -> tuple[float, np.ndarray]:
     """Asks, with its gradient, for a plausible noise and length-scales.
+
+    ``theta`` holds log length-scales, log signal deviation, log signal to noise.
 
     The noise is that of log chi^2_1 within 5 %, and no length-scale is far below the
     standard deviation of its input.

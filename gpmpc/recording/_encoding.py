@@ -27,7 +27,13 @@ if TYPE_CHECKING:
 
 Array = np.ndarray
 _STATE_ARRAYS = ("reference", "state", "measured", "innovation")  # (n,) of a step
-_PROGRAM_ARRAYS = ("P", "q", "G", "lower", "upper")  # as ``Solution.arrays`` has them
+_PROGRAM_ARRAYS = (
+    "P",
+    "q",
+    "G",
+    "lower",
+    "upper",
+)  # as in ``QPSolution.arrays``: bounds of the box first
 _STATUS_NUMBERS = {status: number for number, status in enumerate(Status)}
 
 
@@ -69,6 +75,7 @@ class StepCopy:
                     f"got {contiguous[name].shape}"
                 )
         self.step = step
+        # One after the other in the order of ``_shapes``, as ``arrays`` splits them.
         self.data = b"".join(contiguous.values())
         self._shapes = {name: array.shape for name, array in contiguous.items()}
 

@@ -243,14 +243,14 @@ class _CascadeFlight:
         if phase == 0:
             self._outer.add(
                 state=state,
-                measured=measured,
+                measured_by_simulator=measured,
                 command=thrust,
                 input=thrust.input,
                 reference=self._scenario.reference_states_from(outer_step),
             )
         self._inner.add(
             state=state,
-            measured=measured,
+            measured_by_simulator=measured,
             command=moments,
             input=result.input[1:],
             reference=attitude_states,

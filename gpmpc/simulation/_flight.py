@@ -67,7 +67,8 @@ class Flight:
 
     Attributes:
         steps: What was flown so far.
-        last: Command of the last step; None before the first.
+        last: Command of the last step; None before the first. Its ``plan`` is what the
+            next step starts from, after a failure what is left of the last good one.
         error: What ended the flight; None while it goes on.
     """
 
@@ -94,7 +95,7 @@ class Flight:
     def add(
         self,
         state: SystemState,
-        measured: Array,
+        measured_by_simulator: Array,
         command: Command,
         input: Array,
         reference: Array,
@@ -103,13 +104,13 @@ class Flight:
 
         Args:
             state: Of the whole simulator, when the step began.
-            measured: What was measured of it (N,), of all the simulator's states.
+            measured_by_simulator: What was measured of it (N,), of all its states.
             command: What was decided on it.
             input: What was applied in the end (m,).
             reference: The reference states from this step on (H + 1, n).
         """
         own_state = state.part(self._own_states)
-        measured = measured[self._own_states]
+        measured = measured_by_simulator[self._own_states]
         decision = command.decision
         learned = None if decision is None else decision.learned
         # Measured here, outside of what is timed, for the judge to see.

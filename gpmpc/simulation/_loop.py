@@ -266,18 +266,18 @@ def _fly_together(flights: Sequence[Flight], scenario: Scenario) -> None:
         time = round(k * scenario.system.time_step, 9)
         decided = _decide_step(flying, scenario, k, time)
         results = step_together(
-            [step.flight.simulator for step in decided],
+            [decision.flight.simulator for decision in decided],
             time,
-            [step.command.input for step in decided],
+            [decision.command.input for decision in decided],
         )
-        for step, result in zip(decided, results, strict=True):
+        for decision, result in zip(decided, results, strict=True):
             if isinstance(result, Diverged):
-                step.flight.error = result
+                decision.flight.error = result
                 continue
-            step.flight.add(
-                state=step.state,
-                measured=step.measured,
-                command=step.command,
+            decision.flight.add(
+                state=decision.state,
+                measured_by_simulator=decision.measured,
+                command=decision.command,
                 input=result.input,
                 reference=scenario.reference_states_from(k),
             )

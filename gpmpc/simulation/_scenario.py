@@ -53,7 +53,7 @@ class Scenario:
     #: the references of all steps and of the last horizon, columns in order
     path: Reference = field(init=False)
     #: standard deviations (H,) that replace the problem's at every step: a set point's
-    stage_kappas: Array | None = field(init=False)
+    set_point_kappas: Array | None = field(init=False)
 
     def __post_init__(self, references: Reference | Array | Sequence[float]) -> None:
         check_policy(self.on_failure)
@@ -61,8 +61,10 @@ class Scenario:
         check_belongs(self.controller, self.signals, self.name)
         horizon = self.controller.horizon
         reference = read_reference(references).in_order(self.signals)
-        object.__setattr__(self, "stage_kappas", _stage_kappas(reference, horizon))
-        if self.stage_kappas is not None:
+        object.__setattr__(
+            self, "set_point_kappas", _kappas_of_set_point(reference, horizon)
+        )
+        if self.set_point_kappas is not None:
             reference = replace(reference, kappas=None)
         object.__setattr__(self, "path", _path_over(reference, self.steps, horizon))
 
@@ -70,12 +72,13 @@ class Scenario:
         """Returns what the controller is to follow over its horizon from step k on.
 
         Its arrays are copies: what a controller does to them, the path does not see.
+        Its kappas are those of a set point, or where the path has some its next ones.
         """
         end = k + self.controller.horizon
         inputs = self.path.inputs
         if inputs is not None:
             inputs = np.array(inputs[k:end])
-        kappas = self.stage_kappas
+        kappas = self.set_point_kappas
         if self.path.kappas is not None:
             kappas = self.path.kappas[k:end]
         if kappas is not None:
@@ -146,7 +149,7 @@ def check_belongs(controller: Controller, signals: Signals, plant: str) -> None:
     signals_of(controller).check("the controller", signals, plant, "system")
 
 
-def _stage_kappas(reference: Reference, horizon: int) -> Array | None:
+def _kappas_of_set_point(reference: Reference, horizon: int) -> Array | None:
     """Returns the kappas (H,) of a set point, which hold at every step.
 
     None where there are none, and for a path, whose kappas move along with it.
