@@ -593,6 +593,12 @@ def _doubts(
             "past says may correct them: a controller plans with the movement alone, "
             "from its own estimate."
         )
+    if learned.model.correction is not None:
+        doubts.append(
+            "The correction, as the ridge regression beside it, knows the inputs to "
+            "come: where a controller chose them by the states, they tell of these, "
+            "and errors are smaller than those of a forecast made before."
+        )
     noise = learned.noise
     correlated = noise.outputs[np.array(noise.time_constants) > 0]
     if correlated.any():

@@ -297,6 +297,7 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
         noise = replace(learned.noise, outputs=outputs)
         doubts = _doubts(replace(learned, noise=noise), judgement, pieces, train)
         assert any("A controller's tube" in one for one in doubts) == (correlated > 0)
+    assert any("knows the inputs to come" in one for one in doubts)
     # Of short pieces the baselines are fitted to fewer steps.
     short = [replace(run, begins=tuple(range(0, 500, 70))) for run in train]
     train = replace(train, runs=tuple(short))
