@@ -20,7 +20,7 @@ from gpmpc._provenance import code_fingerprint, provenance
 from gpmpc.cli._commands import Result
 from gpmpc.cli._folders import find_modules_here, write_files, writing
 from gpmpc.cli._terminal import print_error
-from gpmpc.exceptions import DataError
+from gpmpc.exceptions import DataError, SettingError
 from gpmpc.logs import IdentifiedModel, Judgement, Log
 from gpmpc.logs._fitting import PAST
 from gpmpc.logs._judging import (
@@ -66,6 +66,7 @@ def learn(arguments: argparse.Namespace) -> Result:
     """
     console = Console(soft_wrap=True, highlight=False, markup=False)
     folder = arguments.to or Path("learned")
+    _check_folder(folder)
     find_modules_here()  # which a mapping may name a system of
     _say_what_is_read(arguments.files, console)
     log = logs.read_log(arguments.files, arguments.mapping, arguments.partial)
@@ -114,6 +115,19 @@ def learn(arguments: argparse.Namespace) -> Result:
         "rows": report.data.to_dict("records"),
     }
     return Result(data, _EXIT_UNUSABLE if reasons else 0)
+
+
+def _check_folder(folder: Path) -> None:
+    """Raises ``SettingError`` where documents in a folder are those of somebody else.
+
+    They are without a model beside them, which ``gpmpc learn`` writes first.
+    """
+    if (folder / _MODEL).exists():
+        return
+    foreign = [name for name in _DOCUMENTS if (folder / name).exists()]
+    if foreign:
+        rule = f"would go over {foreign[0]}, beside which there is no {_MODEL}"
+        raise SettingError("--to", f"{rule}: name another folder; got {folder}")
 
 
 def _say_what_is_read(files: Sequence[Path], console: Console) -> None:

@@ -33,7 +33,7 @@ class Expectation(NamedTuple):
             by_change=np.zeros((n, change.gp.output_dim)),
         )
 
-    def given(
+    def conditioned_on(
         self, state: Array, trusted: NDArray[np.bool_], change: ChangedModel
     ) -> "Expectation":
         """Returns the expectation where some sensors are known to be right.
@@ -47,15 +47,16 @@ class Expectation(NamedTuple):
         of_trusted = self.covariance[:, trusted]
         gain = of_trusted @ np.linalg.pinv(of_trusted[trusted], hermitian=True)
         gain[trusted] = np.eye(int(np.count_nonzero(trusted)))
-        left = np.eye(len(error))
-        left[:, trusted] -= gain
+        # I - K C, what is left of an error before the trusted sensors are heard
+        complement = np.eye(len(error))
+        complement[:, trusted] -= gain
         mean = self.mean + gain @ error[trusted]
         mean[trusted] = state[trusted]
         return Expectation(
             mean=mean,
-            covariance=left @ self.covariance @ left.T,
-            by_input=left @ self.by_input,
-            by_change=left @ self.by_change,
+            covariance=complement @ self.covariance @ complement.T,
+            by_input=complement @ self.by_input,
+            by_change=complement @ self.by_change,
         )
 
     def after(

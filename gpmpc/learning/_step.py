@@ -118,34 +118,38 @@ def _chi2_median(degrees: int) -> float:
     return float(chi2.median(degrees))
 
 
-def _accept(seen: LearningState, comparison: Comparison) -> LearningState:
+def _accept(learning_state: LearningState, comparison: Comparison) -> LearningState:
     """Makes a step a point of the change, and decides whether the change is used."""
-    unexplained_steps = max(0, seen.unexplained_steps - 1)
+    unexplained_steps = max(0, learning_state.unexplained_steps - 1)
     learned = replace(
-        seen,
+        learning_state,
         model=comparison.model_with_step,
         unexplained_steps=unexplained_steps,
     )
     return _count_lead(learned, comparison.lead)
 
 
-def _count_lead(seen: LearningState, lead: float) -> LearningState:
+def _count_lead(learning_state: LearningState, lead: float) -> LearningState:
     """Decides whether the change is used, by its lead over the last steps."""
-    settings = seen.model.learning
-    leads = np.append(seen.leads, lead)[-settings.window :]
+    settings = learning_state.model.learning
+    leads = np.append(learning_state.leads, lead)[-settings.window :]
     total = float(leads.sum())
-    active = total >= 0 if seen.active else total > settings.margin
-    version = seen.version + (active or seen.active)
-    return replace(seen, leads=leads, active=active, version=version).later()
+    active = total >= 0 if learning_state.active else total > settings.margin
+    version = learning_state.version + (active or learning_state.active)
+    return replace(learning_state, leads=leads, active=active, version=version).later()
 
 
-def _count_doubtful_lead(seen: LearningState, lead: float) -> LearningState:
+def _count_doubtful_lead(learning_state: LearningState, lead: float) -> LearningState:
     """Counts a step in doubt, which may end the use of a change but not begin it."""
-    return _count_lead(seen, lead) if seen.active else seen.later()
+    return (
+        _count_lead(learning_state, lead)
+        if learning_state.active
+        else learning_state.later()
+    )
 
 
 def _put_in_doubt(
-    seen: LearningState,
+    learning_state: LearningState,
     step: LearningStep,
     comparison: Comparison,
     expected_if_wrong: Expectation,
@@ -155,27 +159,27 @@ def _put_in_doubt(
     """Holds a measurement back that no prediction explains.
 
     Args:
-        seen: With the measurement.
+        learning_state: With the measurement.
         step: The step that led to it.
         comparison: Of the predictions of the step.
         expected_if_wrong: Where the plant is if all measurements in doubt are wrong.
         trusted_noise_ratios: Those before the steps in doubt.
         bounded_density_to_beat: Of a plant that the measurement before has put forward.
     """
-    trusted = _trusted_sensors(step, expected_if_wrong, seen.model)
-    previous_doubt = seen.doubt  # that the measurement did not resolve
-    unexplained_steps = seen.unexplained_steps
+    trusted = _trusted_sensors(step, expected_if_wrong, learning_state.model)
+    previous_doubt = learning_state.doubt  # that the measurement did not resolve
+    unexplained_steps = learning_state.unexplained_steps
     steps_in_doubt = 1
-    starts = [Expectation.certain(step.state, seen.model)]
+    starts = [Expectation.certain(step.state, learning_state.model)]
     continued_plants: tuple[NewPlant, ...] = ()
     if previous_doubt is None:
         pass
     elif (trusted | previous_doubt.trusted).all():
         # The sensors that were wrong are right again: they were for one step.
-        seen = seen.without_doubt(previous_doubt)
+        learning_state = learning_state.without_doubt(previous_doubt)
         starts = [_begun_now(previous_doubt.expected)]
     else:
-        unexplained_steps = min(seen.unexplained_steps + 1, _PATIENCE)
+        unexplained_steps = min(learning_state.unexplained_steps + 1, _PATIENCE)
         steps_in_doubt = previous_doubt.steps_in_doubt + 1
         continued_plants = _without_last_measurement(
             previous_doubt.new_plants, step, bounded_density_to_beat
@@ -186,17 +190,17 @@ def _put_in_doubt(
             starts.append(previous_doubt.expected)
 
     acts_like_input = _acts_like_input(
-        innovation=seen.innovation(expected_if_wrong),
-        by_input=seen.model.B_inverse @ expected_if_wrong.by_input,
+        innovation=learning_state.innovation(expected_if_wrong),
+        by_input=learning_state.model.B_inverse @ expected_if_wrong.by_input,
         notable=_NOTABLE,
         deviations=_DEVIATIONS,
     )
     bridged = steps_in_doubt <= _LONGEST_BRIDGE and not acts_like_input
     new_plants: tuple[NewPlant, ...] = ()
-    if not _is_frozen(seen, step, expected_if_wrong):
+    if not _is_frozen(learning_state, step, expected_if_wrong):
         new_plants = tuple(
             _new_plant(
-                seen,
+                learning_state,
                 step,
                 start,
                 unexplained_steps,
@@ -207,7 +211,9 @@ def _put_in_doubt(
         )
         new_plants += continued_plants
     doubt = Doubt(
-        expected=expected_if_wrong.given(seen.state, trusted, seen.model),
+        expected=expected_if_wrong.conditioned_on(
+            learning_state.state, trusted, learning_state.model
+        ),
         trusted=trusted,
         trusted_noise_ratios=trusted_noise_ratios,
         new_plants=new_plants,
@@ -215,10 +221,10 @@ def _put_in_doubt(
         bridged=bridged,
     )
     in_doubt = replace(
-        seen,
+        learning_state,
         unexplained_steps=unexplained_steps,
         doubt=doubt,
-        version=seen.version + (doubt.tried_plant is not None),
+        version=learning_state.version + (doubt.tried_plant is not None),
     )
     return _count_doubtful_lead(in_doubt, comparison.lead)
 
@@ -246,7 +252,7 @@ def _without_last_measurement(
         step: The step that none of them explains.
         density_to_beat: Bounded log density that the one of a plant has to exceed.
     """
-    kept = []
+    remaining_plants = []
     for plant in plants:
         surprise = plant.model.learning.surprise
         expected = plant.after(step)
@@ -261,8 +267,8 @@ def _without_last_measurement(
         if is_tried:
             confirmations_left = max(1, confirmations_left - 1)
             trusted = _trusted_sensors(step, expected, plant.model)
-            expected = expected.given(step.next_state, trusted, plant.model)
-        kept.append(
+            expected = expected.conditioned_on(step.next_state, trusted, plant.model)
+        remaining_plants.append(
             plant._replace(
                 model=plant.model.later(1.0),
                 expected=expected,
@@ -270,11 +276,11 @@ def _without_last_measurement(
                 tried=is_tried,
             )
         )
-    return tuple(kept)
+    return tuple(remaining_plants)
 
 
 def _new_plant(
-    seen: LearningState,
+    learning_state: LearningState,
     step: LearningStep,
     start: Expectation,
     unexplained_steps: int,
@@ -284,14 +290,14 @@ def _new_plant(
     """Returns the plant whose change explains a measurement.
 
     Args:
-        seen: With the measurement.
+        learning_state: With the measurement.
         step: That led to it.
         start: Where the plant was before; ``by_change`` says since when it is changed.
         unexplained_steps: Each asks for a further confirmation.
         steps_in_doubt: This one included.
         may_be_tried: Whether several sensors err together, from what is trusted.
     """
-    model = seen.model.without_points()
+    model = learning_state.model.without_points()
     surprise = model.learning.surprise
     expected = start.after(step, model.model, model)
     error = state_difference(step.next_state, expected.mean, model.angles)
@@ -309,9 +315,9 @@ def _new_plant(
     confirmations = 1 + unexplained_steps + int(min(further, _MOST_CONFIRMATIONS))
     tried = False
     if may_be_tried and confirmations <= steps_in_doubt <= _LONGEST_BRIDGE:
-        planned = seen.expect(start, step)
+        planned = learning_state.expect(start, step)
         tried = _acts_like_input(
-            innovation=seen.innovation(planned),
+            innovation=learning_state.innovation(planned),
             by_input=model.B_inverse @ planned.by_input,
             notable=surprise,
         )
@@ -332,10 +338,14 @@ def _trusted_sensors(
     return (error**2 <= threshold) & ~step.repeats
 
 
-def _is_frozen(seen: LearningState, step: LearningStep, expected: Expectation) -> bool:
+def _is_frozen(
+    learning_state: LearningState, step: LearningStep, expected: Expectation
+) -> bool:
     """Returns whether a sensor repeats itself exactly while the plant moves."""
-    motion = state_difference(expected.mean, step.state, seen.model.angles)
-    threshold = seen.model.learning.surprise * np.diagonal(expected.covariance)
+    motion = state_difference(expected.mean, step.state, learning_state.model.angles)
+    threshold = learning_state.model.learning.surprise * np.diagonal(
+        expected.covariance
+    )
     return bool(((motion**2 > threshold) & step.repeats).any())
 
 
@@ -365,49 +375,62 @@ def _acts_like_input(
 
 
 def _resolve_doubt(
-    seen: LearningState, step: LearningStep, comparison: Comparison, doubt: Doubt
+    learning_state: LearningState,
+    step: LearningStep,
+    comparison: Comparison,
+    doubt: Doubt,
 ) -> LearningState:
     """Explains the measurement in doubt by the one after it."""
-    settings = seen.model.learning
+    settings = learning_state.model.learning
     # The measurement was wrong: what is measured follows from the state before it.
-    expected_if_wrong = seen.expect(doubt.expected, step)
-    if_wrong = seen.innovation(expected_if_wrong)
+    expected_if_wrong = learning_state.expect(doubt.expected, step)
+    if_wrong = learning_state.innovation(expected_if_wrong)
     # The plant was moved: what is measured follows from the measurement in doubt.
-    if_moved = comparison.planned(seen.active)
+    if_moved = comparison.planned(learning_state.active)
 
     density_to_beat = max(if_wrong.log_density, if_moved.log_density) + LARGEST_LEAD
     plants = [_confirmed(plant, step, density_to_beat) for plant in doubt.new_plants]
     confirmed = tuple(plant for plant in plants if plant is not None)
     for plant in confirmed:
         if plant.confirmations_left == 0:
-            return _switch_plant(seen.without_doubt(doubt), plant.model)
+            return _switch_plant(learning_state.without_doubt(doubt), plant.model)
     if confirmed:
-        trusted = _trusted_sensors(step, expected_if_wrong, seen.model)
-        still = Doubt(
-            expected=expected_if_wrong.given(seen.state, trusted, seen.model),
+        trusted = _trusted_sensors(step, expected_if_wrong, learning_state.model)
+        continued_doubt = Doubt(
+            expected=expected_if_wrong.conditioned_on(
+                learning_state.state, trusted, learning_state.model
+            ),
             trusted=trusted,
             trusted_noise_ratios=doubt.trusted_noise_ratios,
             new_plants=tuple(p._replace(model=p.model.later(1.0)) for p in confirmed),
             steps_in_doubt=doubt.steps_in_doubt + 1,
         )
-        confirmed_once = replace(seen, doubt=still, version=seen.version + 1)
+        confirmed_once = replace(
+            learning_state, doubt=continued_doubt, version=learning_state.version + 1
+        )
         return _count_doubtful_lead(confirmed_once, comparison.lead)
     if if_wrong.largest_square <= settings.surprise:
-        return _count_doubtful_lead(seen.without_doubt(doubt), comparison.lead)
+        return _count_doubtful_lead(
+            learning_state.without_doubt(doubt), comparison.lead
+        )
     if if_moved.largest_square <= settings.surprise:
         # A plant that moves is seen by several sensors; one alone may be wrong twice.
-        alone = np.count_nonzero(if_wrong.squares > settings.surprise) == 1
-        if alone and doubt.bridged and doubt.steps_in_doubt < _LONGEST_BRIDGE:
-            after = _bridge_again(seen, step, doubt, expected_if_wrong)
+        is_single_sensor = np.count_nonzero(if_wrong.squares > settings.surprise) == 1
+        if (
+            is_single_sensor
+            and doubt.bridged
+            and doubt.steps_in_doubt < _LONGEST_BRIDGE
+        ):
+            after = _bridge_again(learning_state, step, doubt, expected_if_wrong)
         else:
-            after = seen.without_doubt(doubt)
+            after = learning_state.without_doubt(doubt)
         return _count_doubtful_lead(after, comparison.lead)
     bounded_density = max(
         if_wrong.bounded_log_density(settings.surprise),
         if_moved.bounded_log_density(settings.surprise),
     )
     return _put_in_doubt(
-        seen,
+        learning_state,
         step,
         comparison,
         expected_if_wrong,
@@ -417,22 +440,24 @@ def _resolve_doubt(
 
 
 def _bridge_again(
-    seen: LearningState,
+    learning_state: LearningState,
     step: LearningStep,
     doubt: Doubt,
     expected_if_wrong: Expectation,
 ) -> LearningState:
     """Does not act on a measurement, either, that follows from the one in doubt."""
-    trusted = _trusted_sensors(step, expected_if_wrong, seen.model)
+    trusted = _trusted_sensors(step, expected_if_wrong, learning_state.model)
     bridged = Doubt(
-        expected=expected_if_wrong.given(seen.state, trusted, seen.model),
+        expected=expected_if_wrong.conditioned_on(
+            learning_state.state, trusted, learning_state.model
+        ),
         trusted=trusted,
         trusted_noise_ratios=doubt.trusted_noise_ratios,
         new_plants=(),
         steps_in_doubt=doubt.steps_in_doubt + 1,
         bridged=True,
     )
-    return replace(seen, doubt=bridged)
+    return replace(learning_state, doubt=bridged)
 
 
 def _resolve_outside_model(
@@ -448,7 +473,7 @@ def _resolve_outside_model(
     """
     model = before.model
     unknown = np.full_like(before.observed_change, np.nan)
-    seen = before.with_measurement(measured, unknown, before.noise_ratios)
+    learning_state = before.with_measurement(measured, unknown, before.noise_ratios)
     step = LearningStep(
         state=before.state,
         input=input,
@@ -458,10 +483,10 @@ def _resolve_outside_model(
         latent_variance=observed.latent_variance,
         noise_variance=_noise_variance(doubt.trusted_noise_ratios, model),
     )
-    expected = seen.expect(doubt.expected, step)
-    innovation = seen.innovation(expected)
+    expected = learning_state.expect(doubt.expected, step)
+    innovation = learning_state.innovation(expected)
     if innovation.largest_square <= model.learning.surprise:
-        return seen.without_doubt(doubt).later()
+        return learning_state.without_doubt(doubt).later()
     steps_in_doubt = doubt.steps_in_doubt + 1
     bridged = steps_in_doubt <= _LONGEST_BRIDGE and not _acts_like_input(
         innovation=innovation,
@@ -470,16 +495,18 @@ def _resolve_outside_model(
         deviations=_DEVIATIONS,
     )
     trusted = _trusted_sensors(step, expected, model)
-    still = Doubt(
-        expected=expected.given(measured, trusted, model),
+    continued_doubt = Doubt(
+        expected=expected.conditioned_on(measured, trusted, model),
         trusted=trusted,
         trusted_noise_ratios=doubt.trusted_noise_ratios,
         new_plants=(),
         steps_in_doubt=steps_in_doubt,
         bridged=bridged,
     )
-    unexplained_steps = min(seen.unexplained_steps + 1, _PATIENCE)
-    return replace(seen, doubt=still, unexplained_steps=unexplained_steps).later()
+    unexplained_steps = min(learning_state.unexplained_steps + 1, _PATIENCE)
+    return replace(
+        learning_state, doubt=continued_doubt, unexplained_steps=unexplained_steps
+    ).later()
 
 
 def _confirmed(
@@ -523,14 +550,16 @@ def _innovation_of(
     )
 
 
-def _switch_plant(seen: LearningState, new_plant: ChangedModel) -> LearningState:
-    """Forgets what was seen, and uses the change of another plant."""
+def _switch_plant(
+    learning_state: LearningState, new_plant: ChangedModel
+) -> LearningState:
+    """Forgets what was learning_state, and uses the change of another plant."""
     switched = replace(
-        seen,
+        learning_state,
         model=new_plant,
-        leads=seen.leads[:0],
+        leads=learning_state.leads[:0],
         active=True,
-        version=seen.version + 1,
+        version=learning_state.version + 1,
         doubt=None,
     )
     return switched.later()

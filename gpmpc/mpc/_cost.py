@@ -203,7 +203,7 @@ class LeastSquares:
     #: a function of tensors, states (H, n), inputs (H, m) and, where the controller is
     #: handed ``parameters``, these (H, q), that gives (H, d), each row of its own
     #: stage; or a CasADi function of vectors. It may take fewer: the states, or states
-    #: and inputs
+    #: and inputs. Arguments with a default other than None are its own, and keep it
     y: Any
     #: W, the diagonal (d,) or the matrix (d, d); matrices (H, d, d) by stage, zero
     #: where y costs nothing
@@ -440,8 +440,14 @@ def _count_once(function: Any) -> tuple[int, int]:
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     positional = [p for p in parameters if p.kind in kinds]
     takes_any = any(p.kind is p.VAR_POSITIONAL for p in parameters)
-    most = 3 if takes_any else len(positional)
-    return sum(p.default is p.empty for p in positional), most
+    required = sum(p.default is p.empty for p in positional)
+    if takes_any:
+        return required, 3
+    # A default other than None binds a constant, as in ``lambda x, c=c: x - c``: it
+    # and those behind it are the function's own.
+    is_own = [p.default is not p.empty and p.default is not None for p in positional]
+    most = is_own.index(True) if True in is_own else len(positional)
+    return required, most
 
 
 def _weight(key: str, value: Any) -> Array:

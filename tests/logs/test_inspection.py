@@ -262,6 +262,19 @@ def test_learn_writes_its_three_files_and_names_mistakes(tmp_path):
     )
 
 
+def test_documents_of_somebody_else_are_left_alone(tmp_path):
+    page = tmp_path / "notes" / "report.md"
+    page.parent.mkdir()
+    page.write_text("mine")
+    result = forked("learn", "map.yaml", "a.csv", "--to", "notes", cwd=tmp_path)
+    expected = (
+        "gpmpc: --to: would go over report.md, beside which there is no "
+        "model.safetensors: name another folder; got notes\n"
+    )
+    assert (result.returncode, result.stderr) == (2, expected)
+    assert page.read_text() == "mine"
+
+
 def test_runs_that_are_too_short_to_judge_on_are_refused_first(tmp_path):
     rows = [f"{0.1 * k},{k % 7},{k % 5}" for k in range(60)]
     short = tmp_path / "short.csv"

@@ -242,6 +242,15 @@ def test_a_constraint_of_inputs_is_kept_over_a_horizon_of_one():
     assert decision.inputs == pytest.approx(np.full((1, 2), 0.05), abs=1e-8)
 
 
+def test_a_default_that_is_bound_is_the_functions_own():
+    centre = torch.as_tensor(CENTRE)
+    bound = Inequality(lambda x, c=centre: disc(x, None, c))
+    assert np.array_equal(
+        flown(controller(bound), [1.2, 0.0], steps=4),
+        flown(controller(Inequality(disc)), [1.2, 0.0], steps=4),
+    )
+
+
 def test_bounds_hold_at_the_stages_that_they_are_for():
     box = Box([-np.inf] * 2, [0.2, np.inf], stages=range(3, 6))
     plan = controller(box).control(
