@@ -1940,12 +1940,7 @@ void gpmpc_hold(gpmpc_reference *reference, const gpmpc_real state[GPMPC_STATES]
 /* Whether parameters, which are measured as the state is, are finite. */
 static int knows_parameters(const gpmpc_reference *reference)
 {
-#if GPMPC_PARAMETERS
     return all_finite(&reference->parameters[0][0], H * GPMPC_PARAMETERS);
-#else
-    (void)reference;
-    return 1;
-#endif
 }
 
 int gpmpc_step_belief(gpmpc_controller *controller, const gpmpc_real mean[GPMPC_STATES],

@@ -274,9 +274,12 @@ class GPPosterior(TensorModel):
         """
         if not self._can_be_on_host:
             return False
-        return not torch.is_grad_enabled() or not any(
-            tensor.requires_grad for tensor in self.prediction_tensors
-        )
+        return not self._has_graph or not torch.is_grad_enabled()
+
+    @cached_property
+    def _has_graph(self) -> bool:
+        """Whether autograd follows one of its tensors."""
+        return any(tensor.requires_grad for tensor in self.prediction_tensors)
 
     @cached_property
     def _can_be_on_host(self) -> bool:

@@ -129,7 +129,7 @@ def test_a_recording_tells_how_many_points_a_saved_model_has(tmp_path):
         model=range(7),
         learning=None,
         seed=0,
-        unplanned_noise=lambda training: np.zeros(6),
+        unplanned_noise=lambda training, controller: np.zeros(6),
     )
     bounds = Box(np.zeros(3), np.ones(3))
     controller = SimpleNamespace(problem=SimpleNamespace(inputs=bounds), horizon=2)
