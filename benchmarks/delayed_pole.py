@@ -76,7 +76,7 @@ def fly(
     weights[:4] = 1.0, 3.0, 0.3, 0.3
     problem = Problem(
         Tracking(weights.tolist(), [20.0]),
-        Box(*(limit.tolist() for limit in pole.limits)),
+        Box(*(limit.tolist() for limit in pole.input_limits)),
     )
     controller = GPMPC(
         planned, Linearization(), problem, HORIZON, [0.0], PredictionSettings()

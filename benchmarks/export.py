@@ -333,7 +333,7 @@ def late_pole() -> Case:
     pole = delayed_pole.pole
     problem = Problem(
         Tracking(weights.tolist(), [20.0]),
-        Box(*(limit.tolist() for limit in pole.limits)),
+        Box(*(limit.tolist() for limit in pole.input_limits)),
     )
     controller = GPMPC(
         planned, Linearization(), problem, delayed_pole.HORIZON, [0.0], iterations=1

@@ -313,7 +313,7 @@ COMMANDS = {
                 nargs="+",
                 metavar="RUN",
                 default=[],
-                help="runs to judge it on (a fifth of all)",
+                help="runs to judge it on (by default a fifth of those that can tell)",
             ),
             _folder("folder for the model, its report and its card (learned)"),
             _argument(

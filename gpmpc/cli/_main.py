@@ -104,8 +104,6 @@ def _parse(name: str, command: Subcommand, words: Sequence[str]) -> argparse.Nam
 def _call(module: str, function: str, argument: Any) -> Result:
     """Calls a function of a module of ``gpmpc.cli``, which is imported now.
 
-    It bears the name of its command.
-
     Raises:
         GpmpcError: Code of the user's ended the process (``sys.exit``).
     """

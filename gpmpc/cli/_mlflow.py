@@ -43,6 +43,7 @@ def track(folder: RunFolder, result: Mapping[str, Any]) -> bool:
         written = path / _WRITTEN
         if written.exists() and written.read_text() == digits:
             return True
+        write_whole(written, "", flush=False)  # where nothing may be written, is none
         log_to_mlflow(path, result)
         write_whole(written, digits, flush=False)
     except Exception as error:

@@ -398,7 +398,7 @@ def _continue(fields: Any, previous: Decision) -> None:
         view(fields.disturbance)[:] = previous.disturbance
     fields.has_input = int(np.isfinite(previous.input).all())
     fields.has_plan = int(fits and previous.applicable)
-    fields.unmeasured_steps = previous.unmeasured_steps
+    fields.policy_steps = previous.policy_steps
     if fields.has_plan:
         view(fields.means)[:] = previous.means
         view(fields.inputs)[:] = previous.inputs

@@ -42,7 +42,7 @@ def fields_type(
         _fields_ = (
             ("has_input", ctypes.c_int),
             ("has_plan", ctypes.c_int),
-            ("unmeasured_steps", ctypes.c_int),
+            ("policy_steps", ctypes.c_int),
             ("input", number * m),
             ("means", (number * n) * (H + 1)),
             ("inputs", (number * m) * H),

@@ -323,16 +323,16 @@ static void guess_inputs(gpmpc_controller *controller)
    nothing of where the plant is. */
 static int is_used_up(const gpmpc_controller *controller)
 {
-    return controller->unmeasured_steps > 0 && controller->unmeasured_steps > H - 2;
+    return controller->policy_steps > 0 && controller->policy_steps > H - 2;
 }
 
 /* d <- (1 - L) d + L (x - f(x', u')): what the last step showed of a constant error;
-   of steps without a measurement it is the mean */
+   after steps of the policy it is the mean of all */
 static void estimate_disturbance(gpmpc_controller *controller, const real *state)
 {
     real mean[GPMPC_STATES];
     real error[GPMPC_STATES];
-    real gain = GPMPC_DISTURBANCE_GAIN / (1 + (real)controller->unmeasured_steps);
+    real gain = GPMPC_DISTURBANCE_GAIN / (1 + (real)controller->policy_steps);
     int i, a;
     if (!controller->has_plan) {
         fill(controller->disturbance, 0, n);
@@ -459,14 +459,14 @@ static void follow_inputs(gpmpc_controller *controller)
 
 #if GPMPC_HELD
 /* Shares what the plan, moved by full turns (n), did not foresee out over the steps
-   without a measurement. */
+   of the policy. */
 static void share_increments(gpmpc_controller *controller, const real *turns)
 {
     gpmpc_problem *problem = &controller->problem;
     const int planned = H > 1 ? 2 : 1; /* a plan of one stage is used up */
     real before[GPMPC_STATES];
     real c[GPMPC_STATES];
-    real share = 1 / (1 + (real)controller->unmeasured_steps);
+    real share = 1 / (1 + (real)controller->policy_steps);
     int i;
 #if GPMPC_IS_FLOAT
     real c_low[GPMPC_STATES];
@@ -503,7 +503,7 @@ static void write_increments(gpmpc_controller *controller)
     for (i = 0; i < n; i++)
         write_offset(problem, 0, i, problem->states[0][i], last,
                      problem->previous_input);
-    if (controller->unmeasured_steps > 0)
+    if (controller->policy_steps > 0)
         share_increments(controller, turns);
 }
 #endif
@@ -1863,9 +1863,9 @@ static int continue_last_plan(gpmpc_controller *controller)
     int k;
     if (!controller->has_plan)
         return 0;
-    controller->unmeasured_steps++;
-    if (GPMPC_HOLDS && controller->unmeasured_steps > 1)
-        controller->unmeasured_steps = H; /* what a held input leads to is not planned */
+    controller->policy_steps++;
+    if (GPMPC_HOLDS && controller->policy_steps > 1)
+        controller->policy_steps = H; /* what a held input leads to is not planned */
     for (k = 0; k < H; k++) {
         copy(controller->means[k + 1], controller->means[k], n);
         if (k < H - 1)
@@ -1901,7 +1901,7 @@ static int take_plan(gpmpc_controller *controller)
     copy(&problem->inputs[0][0], &controller->inputs[0][0], H * m);
     controller->solution = controller->candidate;
     controller->has_plan = 1;
-    controller->unmeasured_steps = 0;
+    controller->policy_steps = 0;
     return 1;
 }
 
@@ -1910,7 +1910,7 @@ void gpmpc_reset(gpmpc_controller *controller)
     int i;
     controller->has_input = 0;
     controller->has_plan = 0;
-    controller->unmeasured_steps = 0;
+    controller->policy_steps = 0;
     controller->failed = 0;
     controller->status = GPMPC_SOLVED;
     controller->violation = 0;

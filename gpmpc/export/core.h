@@ -194,7 +194,7 @@ typedef struct {
     /* what the next step needs of the last one */
     int has_input; /* whether an input was applied */
     int has_plan;  /* whether there is a plan to go on along */
-    int unmeasured_steps; /* by which the policy has moved that plan on */
+    int policy_steps; /* by which the policy has moved that plan on */
     gpmpc_real input[GPMPC_INPUTS]; /* the one that was applied */
     gpmpc_real means[GPMPC_HORIZON + 1][GPMPC_STATES];
     gpmpc_real inputs[GPMPC_HORIZON][GPMPC_INPUTS];

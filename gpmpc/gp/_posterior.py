@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from gpmpc._dynamics import (
     Array,
@@ -284,6 +285,11 @@ class GPPosterior(TensorModel):
     @cached_property
     def _can_be_on_host(self) -> bool:
         """Whether it is float64 in host memory that no function transform follows."""
+        if any(
+            forward_ad.unpack_dual(tensor).tangent is not None
+            for tensor in self.prediction_tensors
+        ):
+            return False
         numbers = [tensor.detach() for tensor in self.prediction_tensors]
         return self.dtype is torch.float64 and constant_arrays(*numbers) is not None
 

@@ -22,11 +22,22 @@ from gpmpc.learning._changed_model import ChangedModel
 from gpmpc.learning._settings import OnlineLearning
 from gpmpc.learning._state import LearningState
 from gpmpc.learning._step import learn_from_step
-from gpmpc.mpc import Decision, Reference
+from gpmpc.mpc import Decision, PredictionSettings, Reference
 from gpmpc.mpc._controller import check_arguments
 from gpmpc.mpc._sqp import LINEAR_ALGEBRA_FAILURES
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.status import Status
+
+
+def check_no_disturbance_estimate(settings: PredictionSettings) -> None:
+    """Raises ``SettingError`` where a controller that learns estimates a disturbance.
+
+    What both explain would be corrected twice.
+    """
+    gain = settings.disturbance_gain
+    if gain:
+        rule = "must be 0 beside online learning, which explains the same errors"
+        raise SettingError("disturbance_gain", f"{rule}; got {gain}")
 
 
 @explains_arguments
@@ -47,10 +58,7 @@ class LearningController:
         if learning is None:
             learning = OnlineLearning()
         check_kind("learning", learning, OnlineLearning, "OnlineLearning(...)")
-        gain = controller.prediction.settings.disturbance_gain
-        if gain:
-            rule = "must be 0 beside online learning, which explains the same errors"
-            raise SettingError("disturbance_gain", f"{rule}; got {gain}")
+        check_no_disturbance_estimate(controller.prediction.settings)
         self.controller = controller
         self.learning = learning
         self.problem = controller.problem

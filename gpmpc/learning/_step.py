@@ -505,7 +505,10 @@ def _resolve_outside_model(
     )
     unexplained_steps = min(learning_state.unexplained_steps + 1, _PATIENCE)
     return replace(
-        learning_state, doubt=continued_doubt, unexplained_steps=unexplained_steps
+        learning_state,
+        doubt=continued_doubt,
+        unexplained_steps=unexplained_steps,
+        version=learning_state.version + learning_state.active,
     ).later()
 
 
@@ -553,7 +556,7 @@ def _innovation_of(
 def _switch_plant(
     learning_state: LearningState, new_plant: ChangedModel
 ) -> LearningState:
-    """Forgets what was learning_state, and uses the change of another plant."""
+    """Forgets what was seen, and uses the change of another plant."""
     switched = replace(
         learning_state,
         model=new_plant,

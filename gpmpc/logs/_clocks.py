@@ -40,7 +40,11 @@ class Stamps(NamedTuple):
 
 
 def ordered_stamps(
-    stamps: Array, where: str, hint: str = ORDER_ROWS, may_restart: bool = False
+    stamps: Array,
+    where: str,
+    hint: str = ORDER_ROWS,
+    may_restart: bool = False,
+    max_gap: float | None = None,
 ) -> Stamps:
     """Brings rows into the order of their stamps.
 
@@ -56,6 +60,7 @@ def ordered_stamps(
         hint: Says what to do where too many rows run backwards.
         may_restart: Whether the clock may begin anew. Where other tables have times in
             common with this one, nobody knows which.
+        max_gap: Over which values are carried [s], where it is stated.
 
     Raises:
         DataError: A stamp is not finite, or more than ``MOST_OUT_OF_ORDER`` of the rows
@@ -73,7 +78,7 @@ def ordered_stamps(
     rising = _rising_rows(stamps)
     if rising.backwards <= MOST_OUT_OF_ORDER * len(stamps):
         return rising
-    parts = np.split(stamps, _restarts(stamps)) if may_restart else [stamps]
+    parts = np.split(stamps, find_restarts(stamps)) if may_restart else [stamps]
     risings = [_rising_rows(part) for part in parts]
     left_out = sum(part.backwards for part in risings)
     if left_out > MOST_OUT_OF_ORDER * len(stamps):
@@ -83,7 +88,7 @@ def ordered_stamps(
             f"to {stamps[row]:g} s), and {rising.backwards} rows come before the "
             f"latest stamp: {hint}"
         )
-    return _in_turn(risings)
+    return _in_turn(risings, max_gap)
 
 
 def _sorted_rows(stamps: Array, disordered: int) -> Stamps:
@@ -117,7 +122,7 @@ def _rising_rows(stamps: Array) -> Stamps:
     )
 
 
-def _restarts(stamps: Array) -> np.ndarray:
+def find_restarts(stamps: Array) -> np.ndarray:
     """Finds the rows (R,) at which a clock began anew, as after a reboot.
 
     It falls back to about where it had begun, and the rows that follow lie before those
@@ -140,7 +145,7 @@ def _restarts(stamps: Array) -> np.ndarray:
     return np.array(restarts, dtype=int)
 
 
-def _in_turn(parts: Sequence[Stamps]) -> Stamps:
+def _in_turn(parts: Sequence[Stamps], max_gap: float | None) -> Stamps:
     """Puts the rows of parts behind each other, whose clocks have nothing in common.
 
     How long it took from one to the next is unknown: longer than any gap.
@@ -155,7 +160,7 @@ def _in_turn(parts: Sequence[Stamps]) -> Stamps:
         if times:
             steps = np.diff(part.time)
             usual_step = float(np.median(steps)) if len(steps) else 0.0
-            pause = 2 * max(JUMP, JUMP_STEPS * usual_step)
+            pause = 2 * max(JUMP, JUMP_STEPS * usual_step, max_gap or 0.0)
         rows.append(begin + part.rows)
         times.append(part.time - part.time[0] + end + pause)
         breaks.append(np.r_[bool(pause), part.after_reversal[1:]])

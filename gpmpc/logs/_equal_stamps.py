@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from gpmpc._dynamics import Array
+from gpmpc.logs._clocks import find_restarts
 from gpmpc.logs._findings import RunFindings
 
 
@@ -27,7 +28,8 @@ def merge_rows(
     """Makes one row of those of one stamp, where none contradicts another.
 
     Rows that repeat a stamp and have nothing to add stay as they are, and so do rows of
-    which two have different values in one column.
+    which two have different values in one column. After a clock began anew a stamp is
+    another one.
 
     Args:
         rows: In the order of the file.
@@ -35,16 +37,20 @@ def merge_rows(
         findings: Takes how many rows went into others.
     """
     table, times = rows
+    if not np.isfinite(times).all():  # which is refused where rows are ordered
+        return rows
     used = [column for column in dict.fromkeys(columns) if column in table]
-    is_shared = pd.Series(times).duplicated(keep=False).to_numpy()
+    parts = _parts_of_clock(times, table[used].notna().to_numpy())
+    moments = pd.DataFrame({"part": parts, "stamp": times}, index=table.index)
+    is_shared = moments.duplicated(keep=False).to_numpy()
     values = table.loc[is_shared, used]
     if not values.isna().to_numpy().any():
         return rows
-    stamps = times[is_shared]
-    by_stamp = values.groupby(stamps)
+    moments = moments[is_shared]
+    by_stamp = values.groupby([moments["part"], moments["stamp"]])
     numbers = by_stamp.ngroup().to_numpy()  # of the stamp of each row
     has_one_value = (by_stamp.nunique() <= 1).all(axis=1).to_numpy()
-    is_first = ~pd.Series(stamps).duplicated().to_numpy()
+    is_first = ~moments.duplicated().to_numpy()
     filled = by_stamp.bfill()
     is_filled = (values.isna() & filled.notna()).any(axis=1).to_numpy()
     gains = np.zeros(len(has_one_value), dtype=bool)
@@ -64,3 +70,25 @@ def merge_rows(
     stays = np.ones(len(table), dtype=bool)
     stays[is_shared] = is_first | ~is_merged
     return TimedRows(merged[stays], times[stays])
+
+
+def _parts_of_clock(times: Array, has_value: np.ndarray) -> np.ndarray:
+    """Numbers the parts (K,) of rows between which their clock began anew.
+
+    Streams that stand below each other, each with columns of its own, have one clock.
+
+    Args:
+        times: Of the rows (K,) [s].
+        has_value: Whether a row has a value of a column (K, columns).
+    """
+    parts = np.zeros(len(times), dtype=int)
+    begin = 0
+    restarts = find_restarts(times)
+    ends = np.r_[restarts, len(times)][1:]
+    for restart, end in zip(restarts, ends, strict=True):
+        before = has_value[begin:restart].any(axis=0)
+        after = has_value[restart:end].any(axis=0)
+        if (before & after).any():
+            parts[restart:] += 1
+        begin = restart
+    return parts

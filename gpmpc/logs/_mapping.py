@@ -76,8 +76,8 @@ class Signal:
     #: [s] by which its stamps are later than what was measured: one number, or one for
     #: each column. The values are moved back.
     delay: float | tuple[float, ...] = 0.0
-    #: "hold", "linear" or "spherical"; by default states are interpolated and all else
-    #: is held
+    #: "hold", "linear" or "spherical"; by default states are interpolated, and all else
+    #: is held, or averaged where an input changes between rows
     resample: str = ""
     #: of a state, "drop" or "use" (see ``LogMapping.held``); empty takes the mapping's
     held: str = ""

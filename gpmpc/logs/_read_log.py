@@ -190,9 +190,9 @@ def _check_common_rows(
 
     So it is where each stream has rows of its own, or one has longer gaps.
     """
-    has_value = ~np.isnan(np.concatenate([table.values for table in tables]))
-    if has_value.all(axis=1).any():
+    if any((~np.isnan(table.values)).all(axis=1).any() for table in tables):
         return
+    has_value = ~np.isnan(np.concatenate([table.values for table in tables]))
     counts: dict[str, int] = {}  # of rows with a value, by signal
     first = 0
     for signal in mapping.signals:
@@ -252,14 +252,18 @@ def _note_copied_states(
     """
     states = np.concatenate([run.states for run in runs])
     inputs = np.concatenate([run.inputs for run in runs])
+    moving_states = np.ptp(states, axis=0) > 0.0  # before what the mean rounds
+    moving_inputs = np.ptp(inputs, axis=0) > 0.0
     states = states - states.mean(axis=0)
     inputs = inputs - inputs.mean(axis=0)
     state_names = mapping.column_names("states")
     input_names = mapping.column_names("inputs")
-    for name, column in zip(input_names, inputs.T, strict=True):
-        for state_name, state in zip(state_names, states.T, strict=True):
-            if not state.any() or not column.any():
-                continue
+    for j in np.flatnonzero(moving_inputs):
+        for i in np.flatnonzero(moving_states):
+            name = input_names[j]
+            state_name = state_names[i]
+            column = inputs[:, j]
+            state = states[:, i]
             factor = (state @ column) / (state @ state)
             remainder = np.abs(column - factor * state).max()
             if remainder > LARGEST_ROUNDING * np.abs(column).max():

@@ -337,13 +337,16 @@ def _rows_of_pauses(windows: Windows) -> Array:
     """Counts the time steps (W,) that a run paused for before each of its windows.
 
     Starts in neighbouring pieces are a past and the steps ahead apart, and a stride.
+    That of a run is the least distance of its windows: those of folds are not alike.
     """
-    longest = windows.past + windows.ahead + windows.stride
     distances = np.diff(windows.times) / windows.time_step
     is_same_run = np.diff(windows.runs) == 0
+    runs = np.unique(windows.runs, return_inverse=True)[1]
+    strides = np.full(runs.max() + 1, np.inf)
+    np.minimum.at(strides, runs[1:][is_same_run], distances[is_same_run])
+    longest = windows.past + windows.ahead + strides[runs[1:]]
     pauses = np.where(is_same_run, np.maximum(distances - longest, 0.0), 0.0)
     before = np.concatenate([[0.0], np.cumsum(pauses)])
-    runs = np.unique(windows.runs, return_inverse=True)[1]
     first = np.flatnonzero(np.r_[True, ~is_same_run])
     return before - before[first][runs]
 

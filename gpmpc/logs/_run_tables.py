@@ -130,7 +130,9 @@ def _read_topic(
     columns = [column for signal in signals for column in signal.columns]
     rows = TimedRows(table, times)
     table, times = merge_rows(rows, [*columns, *mapping.keep], findings)
-    stamps = ordered_stamps(times, where, hint, may_restart=not topic)
+    stamps = ordered_stamps(
+        times, where, hint, may_restart=not topic, max_gap=mapping.max_gap
+    )
     ordered = table.iloc[stamps.rows]
     measured = ordered
     if any((signal.held or mapping.held) != "use" for signal in signals):
@@ -252,8 +254,8 @@ def _note_stamps(
     ):
         findings.add(kind, count, f"{count} rows{of_topic}: {remedy}")
     text = (
-        f"the clock began anew {stamps.restarts} times: boundaries, the rows on both "
-        "sides are used, and their times go on behind a pause"
+        "the clock began anew: the rows on both sides are used, as pieces of their "
+        "own, and their times go on behind a pause"
     )
     findings.add("clock began anew", stamps.restarts, text)
     jumps = find_jumps(stamps.time, mapping.max_gap)

@@ -234,7 +234,8 @@ def _unit_quaternions(
     if is_wrong.any():
         row = int(np.argmax(is_wrong))
         text = f"{signal.name} in row {row + 1} has norm {norms[row]:.4g}"
-        if is_wrong.sum() > MOST_OFF * is_kept.sum():
+        is_sample = np.isfinite(norms) & is_kept & ~is_empty
+        if is_wrong.sum() > MOST_OFF * is_sample.sum():
             raise DataError(f"{where}: {text}; expected unit quaternions")
         text = f"{text}, as {is_wrong.sum()} samples: no attitude, left out"
         findings.add("norm", is_wrong.sum(), text)

@@ -246,9 +246,9 @@ class Decision:
     #: ``version``, how often it has changed; where it has ``later()``, that is what is
     #: handed on after a step at which the controller was not called
     learned: Any = None
-    #: steps since the last measurement: a policy has moved the plan on by so many, and
-    #: its first mean is predicted
-    unmeasured_steps: int = 0
+    #: steps by which a policy has moved the plan on since it was decided: its first
+    #: mean is then predicted, and not measured
+    policy_steps: int = 0
 
     def __post_init__(self) -> None:
         # a copy, no view of the plan
@@ -265,13 +265,11 @@ class Decision:
 
     @property
     def is_used_up(self) -> bool:
-        """Whether a policy has moved the plan on to its last stage, or beyond.
+        """Whether a policy has left less of the plan than two steps.
 
-        It then says nothing of where the plant is.
+        It then says nothing of what the next step was to be.
         """
-        return self.unmeasured_steps > 0 and (
-            self.unmeasured_steps > len(self.inputs) - 2
-        )
+        return self.policy_steps > 0 and (self.policy_steps > len(self.inputs) - 2)
 
     @cached_property
     def novelty(self) -> float:

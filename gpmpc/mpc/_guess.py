@@ -115,8 +115,8 @@ def _estimate_disturbance(
 
     It comes from the estimate of the last decision and from the state that its input
     led to. Where its plan is of no use, the state was not measured, or the model has no
-    numbers there, the estimate stays as it was. After steps without a measurement the
-    error is that of all of them, and counts as its mean.
+    numbers there, the estimate stays as it was. After steps of a policy the error is
+    that of all of them, and counts as its mean.
     """
     last_estimate = _last_estimate(prediction, last_decision)
     last_plan = request.last_plan
@@ -132,7 +132,7 @@ def _estimate_disturbance(
     error = state_difference(request.state, local.mean[0], prediction.angles)
     if not np.isfinite(error).all():
         return last_estimate
-    gain = prediction.settings.disturbance_gain / (1 + last_plan.unmeasured_steps)
+    gain = prediction.settings.disturbance_gain / (1 + last_plan.policy_steps)
     return last_estimate + gain * (error - last_estimate)
 
 

@@ -423,8 +423,8 @@ class PredictionModel:
     ) -> Stages:
         """Returns a held linearisation as that of the increments since s_{-1}.
 
-        s_{-1} is the state that the last decision began at. Where that was not
-        measured, what the plan did not foresee is due to all steps since then, and
+        s_{-1} is the state that the last decision began at. Where a policy has moved
+        its plan on, what the plan did not foresee is due to all steps since then, and
         counts as its mean.
         """
         last_means = previous.means[:3]
@@ -434,10 +434,10 @@ class PredictionModel:
         last_states = self.linearizer.state(last_means, previous.covariances[:3])
         last_input = request.references.previous_input
         c = plan.states[0] - stages.A[0] @ last_states[0] - stages.B[0] @ last_input
-        if previous.unmeasured_steps:
+        if previous.policy_steps:
             foreseen = last_states[2] - stages.A[0] @ last_states[1]
             foreseen -= stages.B[0] @ previous.inputs[1]
-            c = foreseen + (c - foreseen) / (1 + previous.unmeasured_steps)
+            c = foreseen + (c - foreseen) / (1 + previous.policy_steps)
         if not request.covariance.any():
             n = self.state_dim
             c[n:] = stages.c[0, n:]

@@ -541,8 +541,8 @@ def _plan_of_policy(
     if last is None or last.plan is None or not last.plan.applicable:
         return None
     plan = _shifted(last.plan)
-    if on_failure == "hold" and plan.unmeasured_steps > 1:
-        plan = replace(plan, unmeasured_steps=len(plan.inputs))
+    if on_failure == "hold" and plan.policy_steps > 1:
+        plan = replace(plan, policy_steps=len(plan.inputs))
     input = _input_of_policy(on_failure, plan, last)
     # bounds may change from stage to stage
     input = _within_bounds(controller, input, last.input)
@@ -571,7 +571,7 @@ def _shifted(plan: Decision) -> Decision:
         inputs=one_step_on(plan.inputs),
         means=one_step_on(plan.means),
         covariances=one_step_on(plan.covariances),
-        unmeasured_steps=plan.unmeasured_steps + 1,
+        policy_steps=plan.policy_steps + 1,
         stage_costs=np.empty(0),  # those of the plan before it was shifted
         violation=math.nan,  # likewise
     )

@@ -7,7 +7,8 @@ taken, a step is as long as it lowers the exact penalty
     cost + price of violated rows + sum_k mu' |F(s_k, u_k) - s_{k+1}|
 
 with mu above the multipliers of the dynamics (Nocedal and Wright, 2006, section 18.3).
-The price of a row is twice its largest multiplier, and at most its own: under an exact
+The price of a row is twice its largest multiplier (of hard rows the largest of all),
+and at most its own: under an exact
 price of 1e6 weights a step along a curved row would be refused for what it misses in
 second order (the Maratos effect; section 15.5 there).
 Beside each length stands a second candidate: the dynamics rolled out under the feedback
@@ -282,10 +283,16 @@ class Globalization:
         return self._end_without_step(local, proposed, is_optimum)
 
     def _raise_row_prices(self, multipliers: Array) -> None:
-        """Raises what rows cost in the merit above their multipliers (H, r)."""
+        """Raises what rows cost in the merit above their multipliers (H, r).
+
+        Hard rows have one price: a step may lead into one that no program has met yet.
+        """
         sufficient = 2.0 * np.abs(multipliers).max(axis=0)
         raised = np.maximum(self._merit_terms.prices, sufficient)
         prices = np.minimum(raised, self._highest_prices)
+        is_hard = np.isinf(self._highest_prices)
+        if is_hard.any():
+            prices[is_hard] = prices[is_hard].max()
         self._merit_terms = self._merit_terms._replace(prices=prices)
 
     def _search_line(

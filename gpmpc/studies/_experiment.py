@@ -20,6 +20,7 @@ from gpmpc.exceptions import (
 )
 from gpmpc.gp import Training, Transitions
 from gpmpc.learning import EpisodicLearning, OnlineLearning
+from gpmpc.learning._controller import check_no_disturbance_estimate
 from gpmpc.models import train
 from gpmpc.models._training import KINEMATICS, KinematicsChoice
 from gpmpc.mpc._policy import OnFailure, check_policy
@@ -231,6 +232,9 @@ class Experiment:
                 "learning",
                 "needs a controller that learns a model, and a plant in the loop",
             )
+        settings = getattr(self.controller, "keywords", {}).get("prediction")
+        if isinstance(self.learning, OnlineLearning) and settings is not None:
+            check_no_disturbance_estimate(settings)
         if isinstance(self.learning, EpisodicLearning) and self.model is not None:
             raise SettingError(
                 "learning",

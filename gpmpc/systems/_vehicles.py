@@ -8,8 +8,10 @@ and offsets are parameters.
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
+
 from gpmpc._calls import explains_arguments
-from gpmpc.exceptions import check_number
+from gpmpc.exceptions import SettingError
 from gpmpc.systems._elementary import cos, sin, sqrt, tan
 from gpmpc.systems._system import System
 
@@ -41,7 +43,8 @@ class KinematicBicycle:
     input_names = ("steering", "drive")
 
     def __post_init__(self) -> None:
-        check_number("steering_scale", self.steering_scale, above=0, unit="[rad]")
+        if np.isscalar(self.steering_scale) and self.steering_scale == 0:
+            raise SettingError("steering_scale", "must not be 0 [rad]")
 
     def derivative(self, x: Any, u: Any) -> list[Any]:
         """d/dt (x, y, heading, speed) [m/s, m/s, rad/s, m/s^2]."""

@@ -241,6 +241,32 @@ def test_rows_of_one_stamp_with_different_signals_are_one_row(tmp_path, is_stack
     assert [finding.kind for finding in log.findings] == ["repeated stamp"]
 
 
+def test_rows_of_one_stamp_after_a_clock_began_anew_are_others(tmp_path):
+    table = table_of()
+    streams = []
+    for name in ("x", "u"):
+        streams.append(table[["t", name]].assign(t=table["t"].round(1)))
+    boot = pandas.concat(streams).sort_values("t", kind="stable")
+    later_boot = boot.assign(x=boot["x"] + 2.0, u=boot["u"] + 2.0)[::-1]
+    later_boot = later_boot.sort_values("t", kind="stable")
+    path = written(tmp_path, pandas.concat([boot, later_boot]))
+    (run,) = read_log(path, {**MAPPING, "max_gap": 300.0})
+    first = slice(0, 300)
+    later = slice(300, 600)
+    np.testing.assert_array_equal(run.states[first, 0], table["x"])
+    np.testing.assert_array_equal(run.inputs[first, 0], table["u"])
+    np.testing.assert_array_equal(run.states[later, 0], table["x"] + 2.0)
+    np.testing.assert_array_equal(run.inputs[later, 0], table["u"] + 2.0)
+    assert run.time[300] - run.time[299] > 300.0
+
+
+def test_a_column_of_times_without_a_time_is_named(tmp_path):
+    table = table_of().assign(t=np.nan)
+    table.loc[1, "u"] = np.nan
+    with pytest.raises(DataError, match="the time in row 1 is nan"):
+        read_log(written(tmp_path, table), MAPPING)
+
+
 def test_streams_with_rows_of_their_own_need_a_rate(tmp_path):
     fast = table_of()[["t", "x"]]
     slow = pandas.DataFrame({"t": 0.03 + 0.5 * np.arange(60)})

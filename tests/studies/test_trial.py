@@ -360,3 +360,11 @@ def test_a_plan_leaves_out_what_a_learned_model_takes_for_noise():
 def test_episodes_train_their_models():
     with pytest.raises(SettingError, match=r"\Alearning: episodes train their models"):
         experiment(learning=EpisodicLearning(2))
+
+
+def test_online_learning_beside_a_disturbance_estimate_is_refused_before_a_training():
+    plain = experiment(learning=OnlineLearning())
+    settings = PredictionSettings(disturbance_gain=0.3)
+    estimating = partial(plain.controller, prediction=settings)
+    with pytest.raises(SettingError, match=r"disturbance_gain: must be 0 beside onl"):
+        replace(plain, controller=estimating)

@@ -263,7 +263,7 @@ def test_curvature_is_of_a_unit_of_steering():
     car = kinematic_bicycle(curvature=scale / 0.3, steering_scale=scale).dynamics
     yaw_rate = car.derivative([0.0, 0.0, 0.0, 1.0], [10.0, 0.0])[2]
     assert yaw_rate == pytest.approx(np.tan(10 * scale) / 0.3)
-    with pytest.raises(SettingError, match=r"steering_scale: must be a number above 0"):
+    with pytest.raises(SettingError, match=r"steering_scale: must not be 0 \[rad\]"):
         kinematic_bicycle(steering_scale=0.0)
 
 
