@@ -302,12 +302,17 @@ def test_transforms_and_forward_mode_fall_back_to_torch_unasked():
         tangent = torch.autograd.forward_ad.unpack_dual(mean).tangent
     assert torch.allclose(tangent, mapped[0].sum(-1), atol=1e-12)
     uncertain = Gaussian(states[0], 0.1 * torch.eye(3))
+
+    def mean_of(lengthscales):
+        other = replace(gp, lengthscales=lengthscales)
+        return MomentMatching().propagate(other, uncertain, control).belief.mean
+
+    step = torch.full_like(gp.lengthscales, 1e-5)
     with torch.autograd.forward_ad.dual_level():
-        offset = torch.autograd.forward_ad.make_dual(gp.offset, torch.ones(3))
-        other = replace(gp, offset=offset)
-        moved = MomentMatching().propagate(other, uncertain, control)
-        tangent = torch.autograd.forward_ad.unpack_dual(moved.mean).tangent
-    assert torch.allclose(tangent, torch.ones(3), atol=1e-12)
+        dual = torch.autograd.forward_ad.make_dual(gp.lengthscales, step)
+        tangent = torch.autograd.forward_ad.unpack_dual(mean_of(dual)).tangent
+    change = mean_of(gp.lengthscales + step) - mean_of(gp.lengthscales - step)
+    assert torch.allclose(tangent, change / 2, rtol=1e-5, atol=1e-12)
 
 
 def test_a_float32_model_is_answered_by_torch_in_float32():
