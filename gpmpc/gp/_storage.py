@@ -135,7 +135,7 @@ def posterior_parts(
             f"only a GPPosterior can be saved; got {type(posterior).__name__}"
         )
     check_signals(posterior.signals)
-    header = {
+    header: dict[str, Any] = {
         "predicts": posterior.predicts,
         "input_dim": posterior.input_dim,
         "states": posterior.state_dim,

@@ -151,7 +151,7 @@ def _in_turn(parts: Sequence[Stamps], max_gap: float | None) -> Stamps:
     How long it took from one to the next is unknown: longer than any gap.
     """
     rows = []
-    times = []
+    times: list[Array] = []
     breaks = []
     begin = 0
     end = parts[0].time[0]

@@ -279,7 +279,7 @@ class Log:
         is_short = (past + steps[0] < lengths) & (lengths <= past + longest)
         if not is_short.any():
             return [(windows, tuple(steps))]
-        by_step = []
+        by_step: list[tuple[Windows, tuple[int, ...]]] = []
         for step in steps:
             rows = past + np.where(lengths > past + longest, longest, step)
             starts = np.maximum(lengths - rows, 0).sum()

@@ -4,7 +4,7 @@ import math
 import zipfile
 from collections.abc import Set
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -75,7 +75,7 @@ def read_npz(path: Path, options: ReadOptions) -> LogFile:
     columns: dict[str, np.ndarray] = {}
     with np.load(path, allow_pickle=False) as archive:
         for name, array in tables.items():
-            values = np.atleast_1d(archive[name])
+            values: Any = np.atleast_1d(archive[name])
             if array.dtype.kind == "S":
                 values = np.char.decode(values, "utf-8", "replace")
             if array.is_row:
