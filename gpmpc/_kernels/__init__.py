@@ -50,6 +50,7 @@ __all__ = [
 
 # of which covariances are solved for together; a multiple of sixteen
 _POINTS_AT_ONCE = 256
+_NO_COVARIANCES = np.zeros((0, 0, 0))  # for compiled code, where none are wanted
 
 
 class Expansion(NamedTuple):
@@ -153,7 +154,7 @@ def linearize_gps(
     padded = packed.arrays.points.shape[1]
     solve_rows = k * kernel_rows(H) if covariance else 0
     memory = np.empty((2 * (n + m) + 1 + solve_rows) * padded + 8)
-    variances = np.zeros((H if covariance else 0, k, k))
+    variances = np.zeros((H, k, k)) if covariance else _NO_COVARIANCES
     linearized = LinearizedGPs(
         mean=np.empty((H, k)),
         A=np.empty((H, k, n)),
@@ -172,7 +173,11 @@ def linearize_gps(
         memory=memory,
         out=linearized,
     )
-    return linearized if covariance else linearized._replace(covariance=None)
+    if covariance:
+        return linearized
+    return LinearizedGPs(
+        mean=linearized.mean, A=linearized.A, B=linearized.B, covariance=None
+    )
 
 
 def expand_gps(packed: Packed, x: Array, u: Array) -> Expansion:

@@ -38,7 +38,7 @@ class LinearizedGPs(NamedTuple):
     mean: Array  #: (H, k)
     A: Array  #: by the state (H, k, n)
     B: Array  #: by the input (H, k, m)
-    #: diagonal (H, k, k); None where it was not wanted, (0, k, k) for compiled code
+    #: diagonal (H, k, k); None where it was not wanted, of no points for compiled code
     covariance: Array | None
 
 
