@@ -164,7 +164,8 @@ def _put_in_doubt(
         comparison: Of the predictions of the step.
         expected_if_wrong: Where the plant is if all measurements in doubt are wrong.
         trusted_noise_ratios: Those before the steps in doubt.
-        bounded_density_to_beat: Of a plant that the measurement before has put forward.
+        bounded_density_to_beat: What the bounded log density of a plant that the
+            measurement before has put forward must exceed, for it to be tried.
     """
     trusted = _trusted_sensors(step, expected_if_wrong, learning_state.model)
     previous_doubt = learning_state.doubt  # that the measurement did not resolve
@@ -172,22 +173,21 @@ def _put_in_doubt(
     steps_in_doubt = 1
     starts = [Expectation.certain(step.state, learning_state.model)]
     continued_plants: tuple[NewPlant, ...] = ()
-    if previous_doubt is None:
-        pass
-    elif (trusted | previous_doubt.trusted).all():
-        # The sensors that were wrong are right again: they were for one step.
-        learning_state = learning_state.without_doubt(previous_doubt)
-        starts = [_begun_now(previous_doubt.expected)]
-    else:
-        unexplained_steps = min(learning_state.unexplained_steps + 1, _PATIENCE)
-        steps_in_doubt = previous_doubt.steps_in_doubt + 1
-        continued_plants = _without_last_measurement(
-            previous_doubt.new_plants, step, bounded_density_to_beat
-        )
-        if previous_doubt.bridged:
-            # The change begins with this step, or it began with the first in doubt.
-            starts.append(_begun_now(previous_doubt.expected))
-            starts.append(previous_doubt.expected)
+    if previous_doubt is not None:
+        if (trusted | previous_doubt.trusted).all():
+            # The sensors that were wrong are right again: they were for one step.
+            learning_state = learning_state.without_doubt(previous_doubt)
+            starts = [_begun_now(previous_doubt.expected)]
+        else:
+            unexplained_steps = min(learning_state.unexplained_steps + 1, _PATIENCE)
+            steps_in_doubt = previous_doubt.steps_in_doubt + 1
+            continued_plants = _without_last_measurement(
+                previous_doubt.new_plants, step, bounded_density_to_beat
+            )
+            if previous_doubt.bridged:
+                # The change begins with this step, or with the first in doubt.
+                starts.append(_begun_now(previous_doubt.expected))
+                starts.append(previous_doubt.expected)
 
     acts_like_input = _acts_like_input(
         innovation=learning_state.innovation(expected_if_wrong),
@@ -395,15 +395,12 @@ def _resolve_doubt(
         if plant.confirmations_left == 0:
             return _switch_plant(learning_state.without_doubt(doubt), plant.model)
     if confirmed:
-        trusted = _trusted_sensors(step, expected_if_wrong, learning_state.model)
-        continued_doubt = Doubt(
-            expected=expected_if_wrong.conditioned_on(
-                learning_state.state, trusted, learning_state.model
-            ),
-            trusted=trusted,
-            trusted_noise_ratios=doubt.trusted_noise_ratios,
+        continued_doubt = _continued_doubt(
+            learning_state,
+            step,
+            doubt,
+            expected_if_wrong,
             new_plants=tuple(p._replace(model=p.model.later(1.0)) for p in confirmed),
-            steps_in_doubt=doubt.steps_in_doubt + 1,
         )
         confirmed_once = replace(
             learning_state, doubt=continued_doubt, version=learning_state.version + 1
@@ -421,7 +418,11 @@ def _resolve_doubt(
             and doubt.bridged
             and doubt.steps_in_doubt < _LONGEST_BRIDGE
         ):
-            after = _bridge_again(learning_state, step, doubt, expected_if_wrong)
+            # Nor is a measurement acted on that follows from the one in doubt.
+            continued_doubt = _continued_doubt(
+                learning_state, step, doubt, expected_if_wrong, bridged=True
+            )
+            after = replace(learning_state, doubt=continued_doubt)
         else:
             after = learning_state.without_doubt(doubt)
         return _count_doubtful_lead(after, comparison.lead)
@@ -439,25 +440,34 @@ def _resolve_doubt(
     )
 
 
-def _bridge_again(
+def _continued_doubt(
     learning_state: LearningState,
     step: LearningStep,
     doubt: Doubt,
     expected_if_wrong: Expectation,
-) -> LearningState:
-    """Does not act on a measurement, either, that follows from the one in doubt."""
-    trusted = _trusted_sensors(step, expected_if_wrong, learning_state.model)
-    bridged = Doubt(
-        expected=expected_if_wrong.conditioned_on(
-            learning_state.state, trusted, learning_state.model
-        ),
+    new_plants: tuple[NewPlant, ...] = (),
+    bridged: bool = False,
+) -> Doubt:
+    """Returns a doubt that lasts a step longer.
+
+    Args:
+        learning_state: With the measurement of now.
+        step: The step that led to it.
+        doubt: By the step before.
+        expected_if_wrong: Where the plant is if all measurements in doubt are wrong.
+        new_plants: Those that the next step may confirm.
+        bridged: Whether the controller acts on what is expected.
+    """
+    model = learning_state.model
+    trusted = _trusted_sensors(step, expected_if_wrong, model)
+    return Doubt(
+        expected=expected_if_wrong.conditioned_on(learning_state.state, trusted, model),
         trusted=trusted,
         trusted_noise_ratios=doubt.trusted_noise_ratios,
-        new_plants=(),
+        new_plants=new_plants,
         steps_in_doubt=doubt.steps_in_doubt + 1,
-        bridged=True,
+        bridged=bridged,
     )
-    return replace(learning_state, doubt=bridged)
 
 
 def _resolve_outside_model(
@@ -487,21 +497,19 @@ def _resolve_outside_model(
     innovation = learning_state.innovation(expected)
     if innovation.largest_square <= model.learning.surprise:
         return learning_state.without_doubt(doubt).later()
-    steps_in_doubt = doubt.steps_in_doubt + 1
-    bridged = steps_in_doubt <= _LONGEST_BRIDGE and not _acts_like_input(
+    acts_like_input = _acts_like_input(
         innovation=innovation,
         by_input=model.B_inverse @ expected.by_input,
         notable=_NOTABLE,
         deviations=_DEVIATIONS,
     )
-    trusted = _trusted_sensors(step, expected, model)
-    continued_doubt = Doubt(
-        expected=expected.conditioned_on(measured, trusted, model),
-        trusted=trusted,
-        trusted_noise_ratios=doubt.trusted_noise_ratios,
-        new_plants=(),
-        steps_in_doubt=steps_in_doubt,
-        bridged=bridged,
+    may_be_bridged = doubt.steps_in_doubt < _LONGEST_BRIDGE
+    continued_doubt = _continued_doubt(
+        learning_state,
+        step,
+        doubt,
+        expected,
+        bridged=may_be_bridged and not acts_like_input,
     )
     unexplained_steps = min(learning_state.unexplained_steps + 1, _PATIENCE)
     return replace(
