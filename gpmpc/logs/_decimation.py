@@ -10,8 +10,8 @@ from gpmpc._dynamics import Array
 from gpmpc.logs._resampling import Samples
 
 FEWEST_SAMPLES = 1.5  # for each row, from which on samples lie between rows
-#: of the spread of an input, in the root mean square: its square is the part of an
-#: effect that a regression on the rows' samples misses
+# Of the spread of an input, in the root mean square: one that departs by more, from its
+# held value and from a straight line, changes between rows.
 LARGEST_CHANGE = 0.1
 
 

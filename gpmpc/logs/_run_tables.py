@@ -321,11 +321,8 @@ def _signal_on_grid(
     if len(set(delays)) == 1:
         delays = delays[:1]
         parts = [samples]
-    may_average = (signal.role, signal.kind, signal.resample) == (
-        "inputs",
-        "vector",
-        "",
-    )
+    is_plain_input = signal.role == "inputs" and signal.kind == "vector"
+    may_average = is_plain_input and not signal.resample
     step = 1 / mapping.rate if mapping.rate else 0.0
     columns = []
     for part, delay in zip(parts, delays, strict=True):
