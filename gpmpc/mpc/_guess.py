@@ -197,7 +197,7 @@ def _guess_inputs(prediction: PredictionModel, request: Request) -> Array:
     """Returns the inputs of the first plan (H, m), within bounds and rates."""
     problem = prediction.problem
     inputs = request.guessed_inputs
-    if request.starts_afresh and problem.cost.penalized == "deviations":
+    if problem.cost.penalized == "deviations" and request.starts_afresh:
         bounds = problem.inputs
         inputs = request.references.inputs.clip(bounds.lower, bounds.upper)
     if problem.input_rates.finite:

@@ -6,6 +6,7 @@ later programs of the step keep: but for a first plan's, where they can keep the
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -22,7 +23,6 @@ from gpmpc.mpc._linear_quadratic import CondensedProgram
 from gpmpc.mpc._linearization import LocalProblem, PredictionModel
 from gpmpc.mpc._roll_out import cost_when_followed
 from gpmpc.mpc._sqp import FAILURES
-from gpmpc.mpc._stopwatch import Stopwatch
 from gpmpc.qp import DualActiveSet, QPSolution, QPSolver, QuadraticProgram
 
 Array = np.ndarray
@@ -35,7 +35,7 @@ class PricedSolver:
         prediction: Of the controller.
         solver: Of quadratic programs.
         request: Of the decision.
-        stopwatch: No price is tried once it is late.
+        is_late: Says whether the budget is spent: then no further price is tried.
     """
 
     def __init__(
@@ -43,12 +43,12 @@ class PricedSolver:
         prediction: PredictionModel,
         solver: QPSolver,
         request: Request,
-        stopwatch: Stopwatch,
+        is_late: Callable[[], bool],
     ):
         self._prediction = prediction
         self._solver = solver
         self._request = request
-        self._stopwatch = stopwatch
+        self._is_late = is_late
         self._price_is_due = True  # of elastic rows, by the next program
         # Whether the next program is the first of the step, the only one whose prices
         # are searched by roll-outs.
@@ -116,7 +116,7 @@ class PricedSolver:
         A later program may keep what the first one, linearised along a mere guess,
         could not.
         """
-        if self._stopwatch.is_late:
+        if self._is_late():
             return solution
         exact_prices = self._prediction.constraints.prices
         is_lowered = self._may_be_restored & (self.row_prices < exact_prices)
@@ -210,7 +210,7 @@ class PricedSolver:
         if limits.lowest_trial_price >= limits.exact_price:
             return exact_solution
         is_on_the_way = self._is_first and request.continues_last_plan
-        if is_on_the_way and not self._stopwatch.is_late:
+        if is_on_the_way and not self._is_late():
             followed_free_cost = self._cost_when_followed(program, local, free_solution)
             affordable_cost = followed_free_cost + limits.affordable_extra_cost
             if math.isfinite(affordable_cost):
@@ -241,7 +241,7 @@ class PricedSolver:
         affordable_price = limits.lowest_trial_price
         best = None
         for _ in range(TRIALS):
-            if self._stopwatch.is_late:
+            if self._is_late():
                 break
             price = math.sqrt(affordable_price * unaffordable_price)
             trial_prices = self._lowered(rows, price)
@@ -256,7 +256,7 @@ class PricedSolver:
             self.row_prices = self._lowered(rows, affordable_price)
             return best
         price = limits.lowest_trial_price
-        if self._stopwatch.is_late:
+        if self._is_late():
             price = limits.safe_price
         return self._solve_cheaper(program, exact_solution, rows, price)
 

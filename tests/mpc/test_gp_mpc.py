@@ -17,7 +17,7 @@ from gpmpc.mpc import (
     Reference,
     Timing,
     Tracking,
-    _stopwatch,
+    _control_step,
     gp_mpc,
 )
 from gpmpc.mpc._guess import initial_guess, read_request
@@ -720,7 +720,7 @@ def test_parts_of_a_decision_are_timed_and_share_the_model(monkeypatch):
     controller = GPMPC(model, Linearization(), problem, H, [0.0], iterations=1)
     at = Gaussian.certain(np.ones(2))
     looks = iter([0.0, 1.0, 11.0, 111.0, 1111.0])
-    for module in (gp_mpc, _stopwatch):
+    for module in (gp_mpc, _control_step):
         monkeypatch.setattr(module, "perf_counter", lambda: next(looks))
     assert controller.control(at, reference).timing == Timing(1.0 + 1000.0, 10.0, 100.0)
     looks = iter(
