@@ -622,6 +622,7 @@ def _doubts(
             "takes the noise as white, and is too narrow many steps ahead."
         )
     doubts.append("Outside the ranges of the data (table above) nothing was seen.")
+    doubts += _doubts_of_what_stays(learned, train)
     if learned.model.feedback_outputs:
         doubts.append(
             "The term feedback describes the controller that flew: it predicts such "
@@ -633,4 +634,24 @@ def _doubts(
             "The motors' torque was not found in the log: the model does not turn when "
             "the motors say so."
         )
+    return doubts
+
+
+def _doubts_of_what_stays(learned: IdentifiedModel, train: Log) -> list[str]:
+    """Returns what rows do not tell since something in them never changes."""
+    doubts = []
+    low, high = learned.ranges
+    columns = [*train.space.names, *train.input_names]
+    constant = [
+        name for name, moves in zip(columns, low < high, strict=True) if not moves
+    ]
+    if constant:
+        names = ", ".join(constant)
+        doubts.append(
+            f"Never changed in the data, so that nothing is known of it: {names}."
+        )
+    untold = [name for name, _, error in learned.fit.to_rows() if np.isinf(error)]
+    if untold:
+        names = ", ".join(untold)
+        doubts.append(f"Parameters that the rows do not tell: {names}.")
     return doubts

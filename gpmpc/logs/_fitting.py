@@ -28,6 +28,7 @@ from gpmpc.logs._regression import fit_affine
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._log_model import LogModel
 from gpmpc.models._parametric import AffineNominal
+from gpmpc.models._state_space import StateSpace
 from gpmpc.models._windows import Windows
 
 STEPS = 50  # of the rollouts that models are judged by
@@ -42,6 +43,10 @@ _FIRST_STEPS = (1.0, 30.0)  # or this many time steps at least and at most
 _ROUNDING = 1e-12  # of a state's range: least error of one that does not move
 _EXACT_SHARE = 1e-9  # of an error at rest: what is smaller counts as exact
 _DIVERGED = 1e6  # residual of a rollout that is not finite
+# Of the curvature by parameters of equal effect: a smaller one is of their differences'
+# rounding.
+_LEAST_EIGENVALUE = 1e-9
+_LEAST_UNTOLD = 1e-3  # part of a parameter in directions that nothing tells
 
 
 @dataclass(frozen=True)
@@ -49,7 +54,8 @@ class NominalFit:
     """A fitted nominal model."""
 
     model: LogModel  #: with its parameters
-    #: of the parameters (P,), robust to the correlation of neighbouring windows
+    #: of the parameters (P,), robust to the correlation of neighbouring windows;
+    #: infinite of those that the rows tell nothing of
     standard_errors: Array
 
     def to_rows(self) -> list[tuple[str, float, float]]:
@@ -112,9 +118,13 @@ def fit_nominal(
         # nothing pulls them back.
         from_a_step = np.concatenate([theta0[:count], np.full(lags, log.time_step)])
         theta = min(theta, _minimize(residuals, from_a_step), key=residuals.loss)
+    J = residuals.jacobian(theta)
+    # The search moves what has no effect as well, anywhere: it is put back.
+    has_effect = J.any(axis=0) | (np.arange(len(theta)) >= count)
+    theta = np.where(has_effect, theta, theta0)
     time_constants = np.maximum(theta[count:], 0.0)
     standard_errors = _standard_errors(
-        J=residuals.jacobian(theta),
+        J=J,
         residuals=residuals.of_windows(theta[None])[0],
         block=2 * -(-steps // windows.stride),
     )
@@ -140,8 +150,10 @@ def _minimize(residuals: "_RolloutResiduals", theta0: Array) -> Array:
     """
     with np.errstate(over="ignore", invalid="ignore"):
         if not (np.abs(residuals(theta0)) < _DIVERGED).all():
-            rule = "begin nearer, or with fewer steps"
-            raise DataError(f"the rollouts at theta0 are not finite: {rule}")
+            raise DataError(
+                "the rollouts are not finite where the search of parameters begins, at "
+                f"{residuals.in_words(theta0)}: begin nearer, or with fewer steps"
+            )
         solution = least_squares(
             residuals,
             theta0,
@@ -196,7 +208,11 @@ class _RolloutResiduals:
         self._steps = steps
         spread = np.geomspace(1, steps, _COUNTED_STEPS)
         self._counted = np.unique(spread.round().astype(int))
-        self._scale = errors_at_rest(windows, self._counted)
+        # What never moves has no error at rest, and no unit of its errors: they do not
+        # count.
+        moves = np.repeat(moving_groups(windows), _error_dims(windows.space))
+        at_rest = errors_at_rest(windows, self._counted)
+        self._scale = np.where(moves, at_rest, np.inf)
 
     def __call__(self, theta: Array) -> Array:
         """Computes the residuals of a parameter vector (P,), as a vector."""
@@ -215,6 +231,11 @@ class _RolloutResiduals:
         return np.nan_to_num(
             residuals, nan=_DIVERGED, posinf=_DIVERGED, neginf=-_DIVERGED
         )
+
+    def in_words(self, theta: Array) -> str:
+        """Returns the named ones of a parameter vector (P,) as a text."""
+        named = zip(self._model.nominal.parameter_names, theta, strict=False)
+        return ", ".join(f"{name} {value:g}" for name, value in named)
 
     def loss(self, theta: Array) -> float:
         """Computes the loss that is minimised, of a parameter vector (P,)."""
@@ -245,8 +266,8 @@ def errors_at_rest(windows: Windows, steps: np.ndarray) -> Array:
 
     They are the same for all entries of a group, and never zero.
     """
-    entries = [group.error_dim for group in windows.space.groups]
-    return np.repeat(distances_at_rest(windows, steps), entries, axis=1)
+    distances = distances_at_rest(windows, steps)
+    return np.repeat(distances, _error_dims(windows.space), axis=1)
 
 
 def distances_at_rest(windows: Windows, steps: Sequence[int] | np.ndarray) -> Array:
@@ -254,12 +275,34 @@ def distances_at_rest(windows: Windows, steps: Sequence[int] | np.ndarray) -> Ar
 
     They are never zero.
     """
+    mean, rounding = _at_rest(windows, steps)
+    return np.maximum(mean, 1e-3 * mean.max(axis=0) + rounding)
+
+
+def moving_groups(windows: Windows) -> np.ndarray:
+    """Returns which groups of states move in windows, by more than rounding."""
+    mean, rounding = _at_rest(windows, np.arange(1, windows.ahead + 1))
+    return mean.max(axis=0) > rounding
+
+
+def _at_rest(
+    windows: Windows, steps: Sequence[int] | np.ndarray
+) -> tuple[Array, Array]:
+    """Computes mean errors of a state that does not move (steps, groups).
+
+    Beside them stands what is rounding of each group (groups,).
+    """
     space = windows.space
     start = windows.states[:, windows.past : windows.past + 1]
     errors = windows.errors(np.repeat(start, windows.ahead, axis=1), steps)
     mean = space.distances(errors).mean(axis=0)
     sizes = space.distances(state_widths(space, start[:, 0]))
-    return np.maximum(mean, 1e-3 * mean.max(axis=0) + _ROUNDING * sizes)
+    return mean, _ROUNDING * sizes
+
+
+def _error_dims(space: StateSpace) -> list[int]:
+    """Returns the number of the entries of each group's error."""
+    return [group.error_dim for group in space.groups]
 
 
 def mean_logarithm(errors: Array, at_rest: Array) -> Array:
@@ -275,7 +318,8 @@ def mean_logarithm(errors: Array, at_rest: Array) -> Array:
 def _standard_errors(J: Array, residuals: Array, block: int) -> Array:
     """Computes standard errors of parameters (P,) by a sandwich estimate.
 
-    Residuals may be correlated within blocks of windows.
+    Residuals may be correlated within blocks of windows. Parameters of which they say
+    nothing, or nothing but a sum or a product, have infinite ones.
 
     Args:
         J: Derivatives of the residuals (R, P).
@@ -288,9 +332,18 @@ def _standard_errors(J: Array, residuals: Array, block: int) -> Array:
     scores = gradients.reshape(len(residuals), -1, J.shape[1]).sum(axis=1)
     block = max(min(block, len(scores) // _FEWEST_BLOCKS), 1)
     blocks = np.add.reduceat(scores, np.arange(0, len(scores), block))
-    bread = np.linalg.pinv(J.T @ (J * weights[:, None]))
+    curvature = J.T @ (J * weights[:, None])
+    sizes = np.sqrt(np.diagonal(curvature))
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    eigenvalues, eigenvectors = np.linalg.eigh(curvature / np.outer(sizes, sizes))
+    is_told = eigenvalues > _LEAST_EIGENVALUE
+    told = eigenvectors[:, is_told]
+    bread = told / eigenvalues[is_told] @ told.T / np.outer(sizes, sizes)
     covariance = bread @ (blocks.T @ blocks) @ bread
-    return np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    standard_errors = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    # How much of each parameter is in directions in which the residuals stay (P,).
+    untold = np.linalg.norm(eigenvectors[:, ~is_told], axis=1)
+    return np.where(untold < _LEAST_UNTOLD, standard_errors, np.inf)
 
 
 def fit_least_squares(kinematics: Kinematics, log: Log) -> LogModel:

@@ -225,8 +225,15 @@ class LogModel:
         if memory is None:
             memory = np.empty((*states.shape[:-1], 0))
         nominal = self.nominal_outputs(states, inputs, context, theta)
+        if not self._sees_features:
+            return nominal
         features = self.features(states, inputs, context)
         return nominal + self.learned_outputs(features, memory)
+
+    @property
+    def _sees_features(self) -> bool:
+        """Whether something that is learned, or remembered, is of the features."""
+        return bool(self.gps) or self.weights.size > 0 or not self.memory.empty
 
     def carried_dim(self, input_dim: int, context_dim: int = 0) -> int:
         """Returns the number of entries that are carried on beside a state."""
@@ -357,7 +364,7 @@ class LogModel:
 
     def _features_of_step(self, now: "_ActingState", context: Array) -> Array:
         """Returns the features (..., d) of a step; none where nothing sees them."""
-        if not self.gps and not self.weights.size and self.memory.empty:
+        if not self._sees_features:
             return now.states[..., :0]
         return self.features(now.states, now.inputs, context)
 
@@ -446,8 +453,10 @@ class LogModel:
         states = windows.states[:, rows]
         next_states = windows.states[:, rows.start + 1 : rows.stop + 1]
         inputs, _ = self.acting_inputs(windows, rows, time_constants)
-        context = windows.context[:, rows]
-        modelled = self.outputs(states, inputs, context, theta)
+        # Many time constants side by side make as many inputs of the same states.
+        batch = inputs.shape[:-1]
+        context = _over_batch(windows.context[:, rows], batch)
+        modelled = self.outputs(_over_batch(states, batch), inputs, context, theta)
         measured = self.kinematics.outputs(states, next_states, windows.time_step)
         return measured - modelled
 

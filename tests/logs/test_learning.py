@@ -298,6 +298,11 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
         doubts = _doubts(replace(learned, noise=noise), judgement, pieces, train)
         assert any("A controller's tube" in one for one in doubts) == (correlated > 0)
     assert any("knows the inputs to come" in one for one in doubts)
+    ranges = learned.ranges.copy()
+    ranges[:, 1] = 2.0
+    still = replace(learned, ranges=ranges)
+    *_, doubt = _doubts(still, judgement, pieces, train)
+    assert doubt.endswith(f"nothing is known of it: {train.space.names[1]}.")
     # Of short pieces the baselines are fitted to fewer steps.
     short = [replace(run, begins=tuple(range(0, 500, 70))) for run in train]
     train = replace(train, runs=tuple(short))

@@ -24,6 +24,7 @@ from gpmpc.logs import (
     save_learned,
 )
 from gpmpc.logs._structures import bases
+from gpmpc.models._actuators import FirstOrderLags
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._stored_log_model import (
     LOG_MODEL,
@@ -138,6 +139,40 @@ def test_steering_without_a_unit_is_one_that_turns_by_its_share(tmp_path):
     scale = structure.model.nominal.fixed["steering_scale"]
     assert scale * table["steering"].abs().max() == pytest.approx(0.4)
     assert values["curvature"] == pytest.approx(3 / 5, rel=0.05)
+
+
+def test_lags_and_a_disturbance_are_fitted_beside_named_parameters(tmp_path):
+    plant = kinematic_bicycle(0.02, curvature=3)
+    inputs = excitation(400, (0, 0.3), (0.2, 0.5))
+    acting, _ = FirstOrderLags.of([0.1, 0.1], 0.02).filter(inputs)
+    table = flight(plant, acting).assign(steering=inputs[:, 0], drive=inputs[:, 1])
+    log = log_of(tmp_path, table, CAR)
+    model = bases(log, 40)[0].model
+    model = replace(model, history=(0, 0, 0, 20), time_constants=np.zeros(2))
+    for fitted in (model.nominal.fitted[:1], ()):
+        nominal = replace(model.nominal, fitted=fitted)
+        if not fitted:
+            nominal = replace(nominal, fixed={**nominal.fixed, "curvature": 3.0})
+        fit = fit_nominal(replace(model, nominal=nominal), None, log, 10)
+        assert fit.model.time_constants == pytest.approx(0.1, rel=0.1)
+        assert fit.model.theta == pytest.approx([3.0] * len(fitted), rel=0.02)
+
+
+@pytest.mark.parametrize("dead", ["drive", "speed"])
+def test_a_channel_that_never_moves_leaves_others_told(tmp_path, dead):
+    plant = replace(kinematic_bicycle(0.02, curvature=3), start=(0, 0, 0, 0.5))
+    inputs = excitation(300, (0, 0.3), (0.2, 0.1)) * [1.0, dead == "speed"]
+    table = flight(plant, inputs, noise=0.002)
+    if dead == "speed":
+        table["speed"] = 0.5
+    log = log_of(tmp_path, table, CAR)
+    model = bases(log, 40)[0].model
+    rows = fit_nominal(model, None, log, 10).to_rows()
+    value, error = {name: row for name, *row in rows}["curvature"]
+    assert 0 < error < 1
+    assert value == pytest.approx(3, abs=4 * error)
+    if dead == "drive":
+        assert ("drive_gain", 1.0, np.inf) in rows
 
 
 @pytest.mark.parametrize(("unit", "largest"), [("rad", 0.0), ("", 0.4)])
