@@ -19,6 +19,7 @@ from gpmpc._dynamics import (
     linearize,
     to_array,
 )
+from gpmpc._functions import call
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
@@ -133,7 +134,7 @@ class NoisyModel(Wrapper):
             state: (*batch, n).
             input: (*batch, m).
         """
-        belief = self.model.predict(state, input)
+        belief = call("model", self.model.predict, state, input)
         return Gaussian(belief.mean, belief.covariance + self.noise(state, input))
 
     def linearize(

@@ -19,6 +19,7 @@ from gpmpc._dynamics import (
     linearize,
     tensors_for,
 )
+from gpmpc._functions import call
 from gpmpc.gaussian import Gaussian
 from gpmpc.models._tensors import move
 from gpmpc.signals import Signals, signals_of
@@ -108,7 +109,10 @@ class LinearWrapper(Wrapper):
         check_query(self, state, input)
         n = self.model.state_dim
         Z, W, L, M = tensors_for(self, *self.linear_part)
-        inner = self.model.predict(state[..., :n], state @ Z.mT + input @ W.mT)
+        # What is added to its mean has a derivative also where torch lost the mean's.
+        inner = call(
+            "model", self.model.predict, state[..., :n], state @ Z.mT + input @ W.mT
+        )
         further = self.state_dim - n
         mean = pad(inner.mean, (0, further)) + state @ L.mT + input @ M.mT
         return Gaussian(mean, self._padded(inner.covariance))

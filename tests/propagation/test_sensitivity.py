@@ -11,7 +11,15 @@ from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, backend, remove_points
-from gpmpc.models import Affine, CasadiFunction, DelayedModel, KnownModel, ResidualModel
+from gpmpc.models import (
+    Affine,
+    CasadiFunction,
+    DelayedModel,
+    DisturbedModel,
+    KnownModel,
+    NoisyModel,
+    ResidualModel,
+)
 from gpmpc.propagation import (
     Linearization,
     MeanEquivalence,
@@ -133,6 +141,43 @@ class ModelWithoutGradients:
     def predict(self, state, input):
         mean = 0.9 * state.detach()
         return Gaussian(mean, torch.diag_embed(0.1 + mean**2))
+
+
+class KnownWithoutGradients(ModelWithoutGradients):
+    """Has no covariance, which alone would tell that derivatives are lost."""
+
+    def predict(self, state, input):
+        mean = 0.9 * state.detach()
+        return Gaussian(mean, torch.zeros(*mean.shape, 2))
+
+
+def _noisy(inner):
+    gp = value_model(inner.state_dim, 1, 1)
+    return NoisyModel(inner, gp, [0])
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda inner: inner,
+        lambda inner: DelayedModel(inner, 0.5),
+        lambda inner: DelayedModel(DelayedModel(inner, 1.0), 1.0),
+        lambda inner: DisturbedModel(inner, torch.ones(2, 1), [0.1]),
+        lambda inner: _noisy(DelayedModel(inner, 0.5)),
+        _noisy,
+    ],
+)
+@pytest.mark.parametrize(
+    "propagator",
+    [MeanEquivalence(), Linearization(), Unscented(), MonteCarlo(20)],
+    ids=_name,
+)
+def test_what_a_wrapper_adds_hides_no_lost_derivatives(propagator, wrap):
+    model = wrap(KnownWithoutGradients())
+    n = model.state_dim
+    at = Gaussian(draw(n), 0.1 * torch.eye(n))
+    with pytest.raises(SettingError, match="model: .* derivatives are lost"):
+        differentiate(propagator, model, at, draw(1))
 
 
 @pytest.mark.parametrize("batch", [(), (1,), (3,)], ids=str)
