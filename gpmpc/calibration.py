@@ -19,6 +19,7 @@ effective number of samples is smaller than the count, the more so the larger k.
 Intervals of a coverage count those that do not overlap.
 """
 
+import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -33,7 +34,7 @@ from torch.nn.functional import pad
 from gpmpc._angles import angles_of, whole_turns
 from gpmpc._arrays import read_array
 from gpmpc._calls import explains_arguments
-from gpmpc._dynamics import DynamicsModel
+from gpmpc._dynamics import DynamicsModel, check_next_states
 from gpmpc.exceptions import (
     DataError,
     SettingError,
@@ -44,7 +45,7 @@ from gpmpc.exceptions import (
 )
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Transitions
-from gpmpc.gp._transitions import signals_of_tables
+from gpmpc.gp._transitions import follows_previous, signals_of_tables
 from gpmpc.metrics import (
     binomial_interval,
     interval_coverage,
@@ -52,11 +53,10 @@ from gpmpc.metrics import (
     negative_log_predictive_density,
 )
 from gpmpc.models._past import (
-    has_past,
     measured_dim,
     measured_signals,
     rows_before,
-    states_along,
+    whole_states,
 )
 from gpmpc.propagation import Propagator, best_propagator
 from gpmpc.signals import UNKNOWN, Signals
@@ -67,6 +67,8 @@ if TYPE_CHECKING:
 # Starts propagated at once: bounds the memory of moment matching at about CHUNK N^2
 # numbers.
 CHUNK = 64
+
+_log = logging.getLogger(__name__)
 
 
 @explains_arguments
@@ -119,10 +121,10 @@ class Recording:
     def chained(cls, transitions: Transitions) -> list["Recording"]:
         """Finds the runs in transitions.
 
-        A run goes on while a row's next state is the following row's state.
+        A run goes on while a row's next state is the following row's state, up to
+        round-off; whole turns of an angle end it.
         """
-        same = transitions.next_states[:-1] == transitions.states[1:]
-        last_rows = torch.nonzero(~same.all(dim=1))[:, 0].tolist()
+        last_rows = torch.nonzero(~follows_previous(transitions))[:, 0].tolist()
         ends = [0, *(row + 1 for row in last_rows), len(transitions)]
         recordings = []
         for begin, end in pairwise(ends):
@@ -200,9 +202,11 @@ def calibrate(
 ) -> Calibration:
     """Predicts held-out recordings from every state, and compares.
 
-    Predictions hold the model's noise once in every case: at each step, where the
-    propagator adds the process noise (all do by default), else at the last one alone,
-    as if it were of the sensors. ``Calibration.noise`` says which.
+    Predictions hold the model's noise once: at each step, where the propagator adds the
+    process noise (all do by default), else at the last one alone, as if it were of the
+    sensors. Where ``measurement_noise`` says what theirs is, a propagator that adds
+    none leaves the model's out. What ``predict`` itself holds, as that of a
+    ``NoisyModel``, is in every step. ``Calibration.noise`` says which.
 
     Args:
         model: What was learned, from other recordings.
@@ -224,7 +228,8 @@ def calibrate(
     Raises:
         ShapeError: Recordings, model or names do not belong together.
         SettingError: A level is not between 0 and 1, no recording is as long as the
-            horizon, or a deviation of the sensors is negative.
+            horizon, a deviation of the sensors is negative, or the model predicts
+            something else than next states.
 
     See Also:
         ``Recording.chained``, which finds the runs in transitions;
@@ -249,6 +254,7 @@ def calibrate(
             ):
                 predictions[step].append(compared)
     columns = [_columns(_joined(step)) for step in predictions]
+    _warn_of_certain(columns, names)
     rmse = _table(columns, lambda c: math.sqrt(mean_squared_error(c.mean, c.observed)))
     deviation = _table(columns, lambda c: math.sqrt(c.variance.mean()))
     independent = [
@@ -273,7 +279,7 @@ def calibrate(
         ),
         width=deviation / rmse,
         independent=torch.tensor(independent),
-        noise=_noise_in_words(noise.moves_state, measurement_noise is not None),
+        noise=_noise_in_words(model, noise.moves_state, measurement_noise is not None),
     )
 
 
@@ -333,9 +339,7 @@ def _predict_recording(
     size = len(recording)
     states = recording.states.to(dtype=model.dtype, device=model.device)
     inputs = recording.inputs.to(dtype=model.dtype, device=model.device)
-    if has_past(model):
-        whole = states_along(model, states.numpy(), inputs.numpy())
-        states = torch.from_numpy(whole)
+    states = whole_states(model, states, inputs)
     further = states.shape[1] - n
     start = pad(noise.start, (0, further, 0, further))
     for first in range(rows_before(model), size, CHUNK):
@@ -384,6 +388,22 @@ def _table(
     return torch.tensor(values, dtype=torch.float64)
 
 
+def _warn_of_certain(columns: list[list[_Predictions]], names: Sequence[str]) -> None:
+    """Logs states of which a prediction has no variance, by step and state."""
+    certain = [
+        names[i]
+        for i in range(len(names))
+        if any(not step[i].variance.all() for step in columns)
+    ]
+    if certain:
+        _log.warning(
+            "calibration: predictions of %s have no variance, at one step or more: "
+            "their likelihood is no number, and intervals hold what they hit alone. "
+            "Give the model a noise",
+            ", ".join(certain),
+        )
+
+
 def _state_names(
     names: Sequence[str], model: DynamicsModel, recordings: list[Recording]
 ) -> tuple[str, ...]:
@@ -396,8 +416,15 @@ def _state_names(
     return tuple(known) or tuple(f"x{i + 1}" for i in range(measured_dim(model)))
 
 
-def _noise_in_words(moves_the_state: bool, sensors_known: bool) -> str:
+def _noise_in_words(
+    model: DynamicsModel, moves_the_state: bool, sensors_known: bool
+) -> str:
     """Says which noise predicted intervals hold."""
+    if not model.noise_covariance.any():
+        sensors = (
+            ", the sensors' at the first step and the last" if sensors_known else ""
+        )
+        return f"what the model itself predicts at every step{sensors}"
     if moves_the_state and sensors_known:
         return "the model's noise at every step, the sensors' at the first and the last"
     if moves_the_state:
@@ -415,11 +442,8 @@ def _check(
     names: tuple[str, ...],
 ) -> None:
     """Raises unless model, recordings, levels and names belong together."""
+    _, m = check_next_states(model)
     n = measured_dim(model)
-    m = model.input_dim
-    if model.output_dim != model.state_dim:
-        rule = f"the model must predict its {model.state_dim} states"
-        raise ShapeError(f"{rule}; it has {model.output_dim} outputs")
     sizes = {(r.states.shape[1], r.inputs.shape[1]) for r in recordings}
     if sizes != {(n, m)}:
         raise ShapeError(

@@ -13,6 +13,7 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Transitions
 from gpmpc.metrics import binomial_interval
+from gpmpc.models import DelayedModel
 from gpmpc.plotting import calibration_figure
 from gpmpc.propagation import Linearization, MeanEquivalence
 
@@ -51,6 +52,16 @@ class LinearGaussian:
 
 
 noiseless = partial(LinearGaussian, noise_covariance=0 * NOISE)
+
+
+def value_model(n, m, outputs, predicts="value"):
+    generator = torch.Generator().manual_seed(0)
+    ones = torch.ones(outputs)
+    features = torch.randn(12, n + m, generator=generator)
+    targets = 0.3 * torch.randn(12, outputs, generator=generator)
+    return GPPosterior.from_hyperparameters(
+        features, targets, torch.ones(outputs, n + m), ones, 0.01 * ones, m, predicts
+    )
 
 
 def runs(count, steps, noisy=True):
@@ -290,6 +301,41 @@ def test_transitions_fall_apart_into_recordings():
     assert second.inputs.ravel().tolist() == [2, 3]
 
 
+def test_round_off_ends_no_run():
+    states = torch.randn(5, 2)
+    next_states = states[1:] * (1 + 1e-15)
+    (run,) = Recording.chained(Transitions(states[:-1], states[1:, :1], next_states))
+    assert len(run) == 4
+
+
+@pytest.mark.parametrize("delays", [(1.0, 1.0), (1.5,)])
+def test_delays_around_gps_in_float32_are_calibrated_as_in_float64(delays):
+    widths = []
+    for dtype in (torch.float32, torch.float64):
+        model = value_model(2, 1, 2, predicts="difference").to(dtype=dtype)
+        for delay in delays:
+            model = DelayedModel(model, delay)
+        torch.manual_seed(0)
+        calibration = calibrate(model, runs(1, 12), Linearization(), horizon=2)
+        widths.append(calibration.width)
+    assert torch.allclose(widths[0], widths[1], rtol=1e-3)
+
+
+def test_what_has_no_variance_is_said_in_the_log(caplog):
+    model = noiseless(Q=torch.diag(torch.tensor([0.0, 0.01])))
+    calibrate(model, runs(1, 4), MeanEquivalence(), names=["angle", "rate"], horizon=2)
+    (line,) = caplog.messages
+    assert "predictions of angle have no variance" in line
+
+
+def test_the_noise_is_called_by_what_holds_it():
+    arguments = {"recordings": runs(1, 4), "horizon": 1}
+    varying = Linearization(process_noise=False)
+    for propagator in (Linearization(), varying):
+        noise = calibrate(noiseless(), propagator=propagator, **arguments).noise
+        assert noise == "what the model itself predicts at every step"
+
+
 def test_misuse_is_refused_with_the_rule():
     model = LinearGaussian()
     recording = runs(1, 4)
@@ -316,6 +362,11 @@ def test_misuse_is_refused_with_the_rule():
         ),
         ({"horizon": 1, "names": ["a"]}, ShapeError, "names must name 2 states; got 1"),
         ({"horizon": 1, "recordings": []}, ShapeError, "got no recording"),
+        (
+            {"horizon": 1, "model": value_model(2, 1, 2)},
+            SettingError,
+            "model: must predict the next state; got GPs with predicts='value'",
+        ),
         (
             {
                 "horizon": 1,

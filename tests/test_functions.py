@@ -170,6 +170,38 @@ def test_measurements_get_the_rule_and_the_name():
             KalmanFilter.extended(MODEL, measurement).update(belief, [0.1])
 
 
+@pytest.mark.parametrize(
+    "lost",
+    [
+        lambda x: x + torch.tensor(np.sin(x.detach().numpy())),
+        lambda x: x * torch.cos(x.flip(-1)).detach(),
+        lambda x: torch.cat([x[..., :1], x[..., 1:].sqrt().detach()], dim=-1),
+    ],
+)
+def test_a_function_that_loses_a_part_of_its_derivative_is_refused(lost):
+    lost_in_part = "function: must be followed by torch as a whole: .* torch finds"
+    with pytest.raises(SettingError, match=lost_in_part):
+        KnownModel(lambda x, u: lost(x) + u, 2, 1)
+    measurement = Measurement(2, torch.eye(2, dtype=F), lost)
+    with pytest.raises(SettingError, match=lost_in_part):
+        KalmanFilter.extended(MODEL, measurement)
+    KalmanFilter.unscented(MODEL, measurement)  # sigma points ask for values alone
+
+
+@pytest.mark.parametrize(
+    "whole",
+    [
+        lambda x: torch.sin(300.0 * x) + x.abs() + torch.relu(x),
+        lambda x: 1e4 * (3.0 * x.float() + torch.exp(x.float())).double(),
+        lambda x: torch.floor(x) + torch.log(x) / (x - 0.5),
+        lambda x: 1e9 + torch.exp(300.0 * x),
+    ],
+)
+def test_kinks_single_precision_and_edges_lose_no_derivative(whole):
+    KnownModel(lambda x, u: whole(x) + u, 2, 1)
+    KalmanFilter.extended(MODEL, Measurement(2, torch.eye(2, dtype=F), whole))
+
+
 def plant(function):
     class Dynamics:
         state_names = ("angle", "rate")

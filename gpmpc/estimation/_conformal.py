@@ -56,10 +56,9 @@ from gpmpc.exceptions import (
 from gpmpc.gaussian import Gaussian
 from gpmpc.models._past import (
     first_signals,
-    has_past,
     measured_dim,
     rows_before,
-    states_along,
+    whole_states,
 )
 from gpmpc.propagation import Propagator, rollout
 from gpmpc.signals import signals_of
@@ -194,10 +193,9 @@ def _with_past(model: DynamicsModel, x: Tensor, u: Tensor) -> tuple[Tensor, int]
     Returns:
         The whole states, and the row from which on they are known.
     """
-    if not has_past(model) or x.shape[1] != measured_dim(model):
+    if x.shape[1] != measured_dim(model):
         return x, 0
-    whole = states_along(model, to_array(x), to_array(u))
-    return torch.from_numpy(whole).to(x), rows_before(model)
+    return whole_states(model, x, u), rows_before(model)
 
 
 @explains_arguments

@@ -34,6 +34,7 @@ from gpmpc._dynamics import (
     DynamicsModel,
     Linearized,
     TensorModel,
+    check_next_states,
     check_query,
     predict_with_jacobian,
 )
@@ -50,12 +51,17 @@ from gpmpc.exceptions import (
     ShapeError,
     check_indices,
     check_kind,
+    check_method,
     check_number,
     check_numbers,
 )
 from gpmpc.gaussian import Gaussian, check_covariance, check_tensors
-from gpmpc.models._nominal import linearize_function
-from gpmpc.propagation import Linearization, Propagator, Unscented
+from gpmpc.models._nominal import (
+    check_slopes,
+    linearize_function,
+    points_near_zero,
+)
+from gpmpc.propagation import Linearization, MeanEquivalence, Propagator, Unscented
 from gpmpc.propagation._propagator import checked_arguments
 from gpmpc.signals import signals_of
 
@@ -244,7 +250,10 @@ class KalmanFilter:
 
     Raises:
         SettingError: Model and measurement have different states, another type or
-            device, or the propagator adds no process noise.
+            device; the model predicts something else than next states; the propagator
+            adds no process noise, or does not say that it does by its attribute
+            ``process_noise``; or one is ``MeanEquivalence``, by which no measurement
+            corrects anything.
 
     See Also:
         ``Measurement``; ``LateMeasurements`` for those that come late; ``smooth`` for
@@ -259,11 +268,7 @@ class KalmanFilter:
         observer: Propagator | None = None,
     ):
         propagator = Linearization() if propagator is None else propagator
-        if isinstance(model, type) or not hasattr(model, "predict"):
-            got = type(model).__name__
-            raise SettingError(
-                "model", f"must be a DynamicsModel, such as GPPosterior; got {got}"
-            )
+        check_next_states(model)
         check_kind("measurement", measurement, Measurement, "Measurement(...)")
         if measurement.state_dim != model.state_dim:
             got = f"{measurement.state_dim} and {model.state_dim}"
@@ -271,18 +276,25 @@ class KalmanFilter:
                 "measurement", f"must be of as many states as the model has; got {got}"
             )
         _check_same_type(model, measurement)
-        if not getattr(propagator, "process_noise", True):
-            rule = "must add the process noise, as Linearization() does"
-            raise SettingError(
-                "propagator", f"{rule}; got {type(propagator).__name__} without"
-            )
+        check_method("propagator", propagator, "propagate", "Linearization()")
+        if not getattr(propagator, "process_noise", False):
+            rule = "must add the process noise, as Linearization() does, and say so"
+            got = f"{type(propagator).__name__} without process_noise"
+            raise SettingError("propagator", f"{rule}; got {got}")
+        _check_correlates("propagator", propagator)
         self.model = model
         self.measurement = measurement
         self.propagator = propagator
         self._names = signals_of(model)
         self._measured_names = _measured_names(measurement, self._names.state_names)
         observer = Linearization() if observer is None else observer
+        check_method("observer", observer, "propagate", "Linearization()")
+        _check_correlates("observer", observer)
         self.observer = _without_noise(observer)
+        is_followed = not hasattr(measurement.function, "linearize")
+        if getattr(self.observer, "first_order", False) and is_followed:
+            point = points_near_zero(measurement.state_dim)
+            check_slopes("function", measurement.function, measurement, *point)
 
     @classmethod
     def extended(cls, model: DynamicsModel, measurement: Measurement) -> "KalmanFilter":
@@ -536,6 +548,16 @@ class LateMeasurements:
             self._measured[k - 1 - age] = measurements[k]
         self.belief = belief
         return self.belief
+
+
+def _check_correlates(key: str, propagator: Propagator) -> None:
+    """Raises ``SettingError`` of a propagator without any Cov[x, y].
+
+    No measurement would correct an estimate by it, and none smooth an earlier one.
+    """
+    if isinstance(propagator, MeanEquivalence):
+        rule = "must say how what follows depends on the state, as Linearization() does"
+        raise SettingError(key, f"{rule}; got MeanEquivalence")
 
 
 def _check_same_type(model: DynamicsModel, measurement: Measurement) -> None:

@@ -44,7 +44,12 @@ from torch import Tensor
 
 from gpmpc._angles import angles_of, state_difference
 from gpmpc._calls import explains_arguments
-from gpmpc._dynamics import DynamicsModel, tensors_for, to_array
+from gpmpc._dynamics import (
+    DynamicsModel,
+    check_next_states,
+    tensors_for,
+    to_array,
+)
 from gpmpc.exceptions import DataError, ShapeError, UnsupportedModel, check_number
 from gpmpc.gaussian import check_tensors
 from gpmpc.gp import (
@@ -56,7 +61,7 @@ from gpmpc.gp import (
 )
 from gpmpc.gp._kernel import kernel_matrix
 from gpmpc.gp._sparse import sparse_posterior
-from gpmpc.gp._transitions import check_transitions
+from gpmpc.gp._transitions import check_transitions, follows_previous
 from gpmpc.models import NoisyModel, ResidualModel
 from gpmpc.models._noisy import noise_features
 from gpmpc.models._residual_data import effect_matrix
@@ -119,6 +124,7 @@ def estimate_process_noise(
 
     Raises:
         ShapeError: The transitions have other dimensions.
+        SettingError: The model predicts something else than next states.
         DataError: There are fewer than ten rows.
 
     >>> from gpmpc.datasets import RandomData
@@ -139,7 +145,7 @@ def estimate_process_noise(
     variance = (squares - latent).mean(0)
     # A variance of the latent function that is too large leaves something.
     floor = 0.01 * squares.mean(0)
-    successive = follows_previous(model, transitions).to(errors.device)
+    successive = follows_previous(transitions, angles_of(model)).to(errors.device)
     correlation = torch.full_like(variance, torch.nan)
     if int(successive.sum()) >= _FEWEST_ROWS:
         first = errors[:-1][successive]
@@ -149,18 +155,6 @@ def estimate_process_noise(
     return ProcessNoise(
         variance=torch.maximum(variance, floor), correlation=correlation
     )
-
-
-def follows_previous(model: Any, transitions: Transitions) -> Tensor:
-    """Finds the rows, from the second on, that begin where the one before ended.
-
-    Returns:
-        Whether each does, to round-off (N - 1,).
-    """
-    after = transitions.next_states[:-1]
-    now = transitions.states[1:]
-    gap = state_difference(after, now, angles_of(model)).abs().amax(1)
-    return gap <= 1e-12 + 1e-9 * now.abs().amax(1)
 
 
 @explains_arguments
@@ -228,8 +222,10 @@ def residuals(model: Any, transitions: Transitions, block: int) -> Residuals:
 
     Raises:
         ShapeError: The transitions have other dimensions.
+        SettingError: The model predicts something else than next states.
         DataError: There are fewer than ten rows.
     """
+    check_next_states(model)
     check_transitions(transitions, model)
     if len(transitions) < _FEWEST_ROWS:
         raise DataError(f"a noise needs ten rows or more; got {len(transitions)}")

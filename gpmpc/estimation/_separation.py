@@ -19,11 +19,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gpmpc._angles import angles_of
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array, DynamicsModel, linearize, to_array
-from gpmpc.estimation._noise import follows_previous, residuals
+from gpmpc.estimation._noise import residuals
 from gpmpc.exceptions import DataError, UnsupportedModel
 from gpmpc.gp import GPPosterior, Transitions
+from gpmpc.gp._transitions import follows_previous
 from gpmpc.models import ResidualModel
 
 _PAIRS = 20  # successive errors, at least
@@ -62,6 +64,8 @@ def separate_noise(
     Raises:
         UnsupportedModel: Another model, or one that was learned from
             pseudo-observations.
+        SettingError: The GPs predict something else than next states, as those inside a
+            ``ResidualModel`` do.
         ShapeError: The transitions have other dimensions.
         DataError: Fewer than twenty rows follow one another.
 
@@ -82,7 +86,7 @@ def separate_noise(
         )
     model = _with_all_noise(model)
     errors = to_array(residuals(model, transitions, block).errors)
-    successive = follows_previous(model, transitions)
+    successive = follows_previous(transitions, angles_of(model))
     later = 1 + np.flatnonzero(successive.cpu().numpy())
     if len(later) < _PAIRS:
         raise DataError(

@@ -364,6 +364,22 @@ def check_transitions(transitions: Any, model: Any = None) -> None:
         signals_of(model).check("the model", transitions.signals, "transitions")
 
 
+def follows_previous(transitions: Transitions, angles: Sequence[int] = ()) -> Tensor:
+    """Finds the rows, from the second on, that begin where the one before ended.
+
+    Args:
+        transitions: N of them, in their order of time.
+        angles: Indices of the states whose whole turns do not count.
+
+    Returns:
+        Whether each does, to round-off (N - 1,).
+    """
+    after = transitions.next_states[:-1]
+    now = transitions.states[1:]
+    gap = state_difference(after, now, angles).abs().amax(1)
+    return gap <= 1e-12 + 1e-9 * now.abs().amax(1)
+
+
 def _check_finite(name: str, value: Tensor) -> None:
     """Raises ``DataError``, with row and column, unless a table is finite."""
     bad = torch.nonzero(~torch.isfinite(value))

@@ -1,6 +1,6 @@
 """Known models x+ = f0(x, u): an affine one, and any function without a GP."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -22,6 +22,8 @@ from gpmpc._functions import call
 from gpmpc.exceptions import GpmpcError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.signals import UNKNOWN, Signals
+
+_WIDTH = 1e-3  # of the steps of differences, besides a point's size
 
 
 @explains_arguments
@@ -127,7 +129,10 @@ class KnownModel:
         self._check_function()
 
     def _check_function(self) -> None:
-        """Raises unless the function gives next states of a batch of states."""
+        """Raises unless the function gives next states of a batch of states.
+
+        torch has to follow all of it.
+        """
         n = self.state_dim
         m = self.input_dim
         rows = n + m + 1  # more than columns: a function of one state shows
@@ -154,6 +159,8 @@ class KnownModel:
             raise ShapeError(
                 f"function {rule} (*batch, {m}); got {got} of {rows} states"
             )
+        if is_followed:
+            check_slopes("function", self.function, self, *points_near_zero(n, m))
 
     @property
     def tape(self) -> Any:
@@ -229,3 +236,99 @@ def linearize_function(
     arrays = [value.unflatten(1, shape)]
     arrays += [jacobian.unflatten(1, shape) for jacobian in jacobians]
     return tuple(to_array(array) for array in arrays)
+
+
+def check_slopes(
+    key: str,
+    function: Callable[..., Tensor],
+    model: Any,
+    *arguments: Array,
+    angles: Sequence[int] = (),
+) -> None:
+    """Raises ``SettingError`` where torch's derivatives are not those of the values.
+
+    A part that torch could not follow (``.detach()``, NumPy, ``torch.tensor``) is
+    missing in them. Central differences of two widths say what they should be, and how
+    far they are to be trusted: of values in single precision, or that bend within a
+    width, the two differ. An entry counts where it is wrong at every point at which it
+    is a number, so that a kink at one of them does not.
+
+    Args:
+        key: What the function is, for the message.
+        function: See ``linearize_function``.
+        model: Has the type and the device of the tensors.
+        arguments: Points (K, d_i) each.
+        angles: Columns of the first argument that are angles: they may count turns,
+            which change no slope.
+    """
+    try:
+        _, *jacobians = linearize_function(function, model, *arguments)
+        points = np.concatenate(arguments, axis=1)
+        width = _WIDTH * (1.0 + np.abs(points))
+        width[:, list(angles)] = _WIDTH
+        sizes = [argument.shape[1] for argument in arguments]
+        values_at = partial(_values_at, function, model, sizes)
+        narrow = _central_differences(values_at, points, width)
+        wide = _central_differences(values_at, points, 2.0 * width)
+    except GpmpcError:
+        raise
+    except Exception:  # not defined there: nothing can be compared
+        return
+    K, v, _ = narrow.shape
+    flat = [
+        part.reshape(K, v, size) for part, size in zip(jacobians, sizes, strict=True)
+    ]
+    slopes = np.concatenate(flat, axis=2)
+    with np.errstate(invalid="ignore", over="ignore"):
+        excess = np.abs(narrow - slopes) - np.abs(wide - narrow)
+        is_off = excess > 1e-3 * (1.0 + np.abs(narrow))
+    is_number = np.isfinite(excess)
+    is_wrong = (is_off | ~is_number).all(axis=0) & is_number.any(axis=0)
+    if not is_wrong.any():
+        return
+    output, column = np.argwhere(is_wrong)[0]
+    point = np.flatnonzero(is_number[:, output, column])[0]
+    raise SettingError(
+        key,
+        "must be followed by torch as a whole: the derivative of its entry "
+        f"{output + 1} by column {column + 1} of (x, u) is "
+        f"{narrow[point, output, column]:.3g}, and torch finds "
+        f"{slopes[point, output, column]:.3g} (a part is lost by .detach(), numpy or "
+        "torch.tensor)",
+    )
+
+
+def points_near_zero(*sizes: int) -> list[Array]:
+    """Returns three points (3, d_i) near zero of arguments of some sizes.
+
+    They are no round numbers, where functions have their kinks.
+    """
+    generator = np.random.default_rng(0)
+    return [generator.uniform(-1.0, 1.0, (3, size)) for size in sizes]
+
+
+def _values_at(
+    function: Callable[..., Tensor], model: Any, sizes: Sequence[int], points: Array
+) -> Array:
+    """Evaluates a function at joint arguments (K, d): its entries (K, v)."""
+    arguments = np.split(points, np.cumsum(sizes)[:-1], axis=1)
+    tensors = tensors_for(model, *map(np.ascontiguousarray, arguments))
+    with torch.no_grad():
+        return to_array(function(*tensors).flatten(1))
+
+
+def _central_differences(
+    values_at: Callable[[Array], Array], points: Array, width: Array
+) -> Array:
+    """Differentiates entries (K, v) by points (K, d), with widths (K, d) of steps.
+
+    Returns:
+        The differences (K, v, d).
+    """
+    K, d = points.shape
+    steps = width[:, None] * np.eye(d)
+    above = values_at((points[:, None] + steps).reshape(K * d, d))
+    below = values_at((points[:, None] - steps).reshape(K * d, d))
+    with np.errstate(invalid="ignore", over="ignore"):
+        change = (above - below).reshape(K, d, above.shape[1])
+        return (change / (2 * width[:, :, None])).swapaxes(1, 2)

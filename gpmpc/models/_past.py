@@ -10,8 +10,9 @@ from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from gpmpc._dynamics import Array, DynamicsModel
+from gpmpc._dynamics import Array, DynamicsModel, to_array
 from gpmpc.gaussian import Gaussian
 from gpmpc.signals import Signals, signals_of
 
@@ -106,6 +107,18 @@ def states_along(model: ModelWithPast, measured: Array, inputs: Array) -> Array:
         state = model.follow(state, input, after)
         states.append(state)
     return np.array(states)
+
+
+def whole_states(model: DynamicsModel, measured: Tensor, inputs: Tensor) -> Tensor:
+    """Completes measured states (T, measured_dim) by what a model remembers.
+
+    Arguments are those of ``states_along``. States of a model without a past are
+    returned as they are. The result has the type and the device of what was measured.
+    """
+    if not has_past(model):
+        return measured
+    whole = states_along(model, to_array(measured), to_array(inputs))
+    return torch.from_numpy(whole).to(measured)
 
 
 def belief_of_all(belief: Gaussian, state: Array) -> Gaussian:

@@ -24,7 +24,7 @@ from gpmpc.gp._data_checks import (
 )
 from gpmpc.models._casadi_function import CasadiFunction
 from gpmpc.models._features import Features
-from gpmpc.models._nominal import Affine, linearize_function
+from gpmpc.models._nominal import Affine, check_slopes
 from gpmpc.models._tensors import check_like
 
 Nominal = Callable[[Tensor, Tensor], Tensor]
@@ -234,59 +234,6 @@ def _output_names(
     return [f"output {a + 1} of the residual" for a in range(outputs)]
 
 
-def _check_slopes(
-    key: str,
-    function: Callable[..., Tensor],
-    x: Array,
-    u: Array,
-    slopes: Array,
-    angles: Sequence[int],
-) -> None:
-    """Raises ``SettingError`` where derivatives are not those of the values.
-
-    A part that torch could not follow (``.detach()``, NumPy, ``torch.tensor``) is
-    missing in them. Central differences say what they should be; an entry counts where
-    it differs at every point, so that a kink at one of them does not.
-
-    Args:
-        key: What the function is, for the message.
-        function: f(x, u), a tensor (K, v).
-        x: (K, n).
-        u: (K, m).
-        slopes: Its derivatives by x and u (K, v, n + m).
-        angles: Indices of the states that are angles.
-    """
-    points = np.concatenate([x, u], axis=1)
-    n = x.shape[1]
-
-    def values_at(points: Array) -> Array:
-        tensors = torch.as_tensor(points)
-        with torch.no_grad():
-            return to_array(function(tensors[:, :n], tensors[:, n:]))
-
-    for column in range(points.shape[1]):
-        width = np.full(len(points), 1e-5)
-        if column not in angles:  # an angle counts turns, which change no slope
-            width *= 1.0 + np.abs(points[:, column])
-        step = np.zeros_like(points)
-        step[:, column] = width
-        above = values_at(points + step)
-        below = values_at(points - step)
-        difference = (above - below) / (2 * width[:, None])
-        excess = np.abs(difference - slopes[:, :, column])
-        is_wrong = (excess > 1e-3 * (1.0 + np.abs(difference))).all(axis=0)
-        if is_wrong.any():
-            output = int(np.flatnonzero(is_wrong)[0]) + 1
-            raise SettingError(
-                key,
-                "must be followed by torch as a whole: the derivative of its entry "
-                f"{output} by column {column + 1} of (x, u) is "
-                f"{difference[0, output - 1]:.3g}, and torch finds "
-                f"{slopes[0, output - 1, column]:.3g} (a part is lost by .detach(), "
-                "numpy or torch.tensor)",
-            )
-
-
 def check_derivatives(
     nominal: Nominal, B: Effect, transitions: Transitions, angles: Sequence[int]
 ) -> None:
@@ -297,20 +244,10 @@ def check_derivatives(
     """
     x = to_array(transitions.states[:2])
     u = to_array(transitions.inputs[:2])
+    like = transitions.states
     with suppress(ShapeError):
         if not hasattr(nominal, "linearize"):
             checked = partial(nominal_next_state, nominal, angles=())
-            _, A, B_u = linearize_function(checked, transitions.states, x, u)
-            by_all = np.concatenate([A, B_u], axis=2)
-            _check_slopes("nominal", checked, x, u, by_all, angles)
+            check_slopes("nominal", checked, like, x, u, angles=angles)
         if callable(B) and not hasattr(B, "linearize"):
-            checked_effect = partial(effect_matrix, B)
-            effect, slopes = linearize_function(checked_effect, transitions.states, x)
-            _check_slopes(
-                "B",
-                lambda states, _: checked_effect(states).flatten(start_dim=1),
-                x,
-                u[:, :0],
-                slopes.reshape(len(x), effect[0].size, x.shape[1]),
-                angles,
-            )
+            check_slopes("B", partial(effect_matrix, B), like, x, angles=angles)

@@ -21,6 +21,7 @@ from gpmpc.estimation import (
 from gpmpc.estimation._conditioning import unexplained_covariance
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
+from gpmpc.gp import GPPosterior
 from gpmpc.models import DelayedModel, DisturbedModel
 from gpmpc.plotting import innovations_figure
 from gpmpc.propagation import (
@@ -574,6 +575,21 @@ def test_white_innovations_of_correlated_sensors_are_white():
     assert autocorrelation(np.hstack([e, e]), np.ones((50, 2, 2))) == alone
 
 
+class NoiseUnsaid:
+    """Adds no noise, and has no attribute that says so."""
+
+    def propagate(self, model, belief, input=None):
+        return Linearization(False).propagate(model, belief, input)
+
+
+def of_values():
+    ones = torch.ones(2, dtype=F)
+    data = torch.eye(3, dtype=F)
+    return GPPosterior.from_hyperparameters(
+        data, data[:, :2], torch.ones(2, 3, dtype=F), ones, 0.1 * ones, 1, "value"
+    )
+
+
 @pytest.mark.parametrize(
     ("make", "error", "rule"),
     [
@@ -637,6 +653,31 @@ def test_white_innovations_of_correlated_sensors_are_white():
             lambda m: KalmanFilter(LINEAR, m, Linearization(False)),
             SettingError,
             "propagator: must add the proc",
+        ),
+        (
+            lambda m: KalmanFilter(LINEAR, m, NoiseUnsaid()),
+            SettingError,
+            "propagator: must add .* and say so; got NoiseUnsaid without process_noise",
+        ),
+        (
+            lambda m: KalmanFilter(LINEAR, m, MeanEquivalence()),
+            SettingError,
+            "propagator: must say how .* depends on the state.*; got MeanEquivalence",
+        ),
+        (
+            lambda m: KalmanFilter(LINEAR, m, observer=MeanEquivalence()),
+            SettingError,
+            "observer: must say how .* depends on the state.*; got MeanEquivalence",
+        ),
+        (
+            lambda m: KalmanFilter(LINEAR, m, observer="exact"),
+            SettingError,
+            "observer: must",
+        ),
+        (
+            lambda m: KalmanFilter(of_values(), m),
+            SettingError,
+            "model: must predict the next state; got GPs with predicts='value'",
         ),
         (
             lambda m: KalmanFilter(LINEAR, m, MeanEquivalence(False)),

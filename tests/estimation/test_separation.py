@@ -14,7 +14,7 @@ from gpmpc.estimation import (
     separate_noise,
     with_process_noise,
 )
-from gpmpc.exceptions import DataError, UnsupportedModel
+from gpmpc.exceptions import DataError, SettingError, UnsupportedModel
 from gpmpc.gp import (
     GPPosterior,
     SlidingWindow,
@@ -165,6 +165,10 @@ def test_what_cannot_be_separated_is_refused():
     for other in (nominal, sparse):
         with pytest.raises(UnsupportedModel, match="can be separated"):
             separate_noise(other, rows)
+    residual, _ = learned(np.full(2, 0.01), np.zeros(2), kind="residual", steps=60)
+    for function in (separate_noise, estimate_process_noise):
+        with pytest.raises(SettingError, match="model: must predict the next state"):
+            function(residual.residual, rows)  # it predicts what is missed, not states
     with pytest.raises(UnsupportedModel, match="pseudo-observations, no data"):
         to_gpytorch(sparse)
     assert isinstance(model, GPPosterior)
