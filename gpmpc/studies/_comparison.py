@@ -18,6 +18,7 @@ import pandas as pd
 from scipy import stats
 
 from gpmpc.exceptions import DataError, SettingError
+from gpmpc.studies._run_record import plain_value
 from gpmpc.studies._runs import SEED, Report, in_order
 
 # Between two choices, behind which the next KEY= begins: values may hold others.
@@ -162,7 +163,8 @@ def _lost_without(runs: pd.DataFrame, measure: str) -> int:
 
 def _parse_choice(report: Report, group: str, choice: str) -> tuple[str, str]:
     """Returns key and value of one choice, both of which must occur in the report."""
-    key, _, value = choice.partition("=")
+    key, _, text = choice.partition("=")
+    value = plain_value(text)
     if key not in report.variables:
         varied = ", ".join(report.variables) or "nothing"
         raise SettingError(
@@ -174,7 +176,7 @@ def _parse_choice(report: Report, group: str, choice: str) -> tuple[str, str]:
     if value not in values:
         raise SettingError(
             f"compare {group}",
-            f"{key} was varied over {', '.join(values)}; got {value!r}",
+            f"{key} was varied over {', '.join(values)}; got {text!r}",
         )
     return key, value
 

@@ -32,6 +32,7 @@ from gpmpc.studies._run_record import (
     READ_ERRORS,
     RunRecord,
     Settings,
+    checked_options,
     read_record,
 )
 
@@ -189,7 +190,7 @@ class RunIndex:
             settings=Settings(base, changes),
             origin=self._shared_origin(_texts_by_name(content["origin"])),
             measures=_finite_measures(content["measures"]),
-            search_options=intern(plain_text(content.get("search_options", ""))),
+            search_options=checked_options(content.get("search_options", "")),
             **texts,
         )
         self._lines[name] = _Line(

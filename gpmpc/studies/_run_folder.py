@@ -448,7 +448,7 @@ def difference(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     for key in dict.fromkeys([*leaves_then, *leaves_now]):
         value_then = leaves_then.get(key)
         value_now = leaves_now.get(key)
-        if not _is_same(value_then, value_now):
+        if not is_same(value_then, value_now):
             differing.append(f"{key}: {value_then!r} then, {value_now!r} now")
     shown = differing[:3]
     if len(differing) > 3:
@@ -456,12 +456,12 @@ def difference(then: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     return ", ".join(shown)
 
 
-def _is_same(then: Any, now: Any) -> bool:
+def is_same(then: Any, now: Any) -> bool:
     """Whether two values of a setting are equal; what is no number equals itself."""
     if isinstance(then, list) and isinstance(now, list) and len(then) == len(now):
-        return all(map(_is_same, then, now))
+        return all(map(is_same, then, now))
     if isinstance(then, Mapping) and isinstance(now, Mapping):
         return then.keys() == now.keys() and all(
-            _is_same(then[key], now[key]) for key in then
+            is_same(then[key], now[key]) for key in then
         )
     return then == now or (then != then and now != now)

@@ -10,6 +10,7 @@ import shlex
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 from sys import intern
@@ -64,6 +65,8 @@ MEASURES: dict[str, Measure] = {
     "training": Measure("training [s]", lambda result: result["times"]["training"]),
 }
 
+
+_EXACT = 1e15  # whole floats below have all their digits
 
 _COLUMNS = (
     "state",
@@ -139,11 +142,7 @@ class RunRecord:
         value = self.settings.get(f"options.{key}")
         if value is None:
             value = self.settings.get(key, "")
-        if isinstance(value, bool) or value is None:
-            return json.dumps(value)
-        if isinstance(value, int | float | str):
-            return plain_text(str(value))
-        return ""
+        return _text_of(value)
 
     def is_of_this_code(self) -> bool:
         """Whether the code that flew it is that which would fly it now."""
@@ -260,6 +259,49 @@ def _code(content: Result) -> str:
 
 def _code_text(of_gpmpc: str | None, of_user: Mapping[str, str]) -> str:
     return json.dumps([of_gpmpc, of_user], sort_keys=True)
+
+
+def _text_of(value: Any) -> str:
+    """Returns a value of a setting as reports name it; empty where it is a mapping."""
+    if isinstance(value, bool) or value is None:
+        return json.dumps(value)
+    if isinstance(value, int):
+        return str(value)
+    if isinstance(value, float):
+        is_whole = value.is_integer() and abs(value) < _EXACT
+        return str(int(value)) if is_whole else str(value)
+    if isinstance(value, str):
+        return plain_text(value)
+    if isinstance(value, list):
+        return f"[{','.join(map(_text_of, value))}]"
+    return ""
+
+
+@lru_cache(maxsize=100_000)
+def plain_value(text: str) -> str:
+    """Returns a typed value as reports name it: 1e-1, 0.10 and 0.1 are one."""
+    quote = text[:1]
+    if quote in ("'", '"') and len(text) > 1 and text.endswith(quote):
+        return text[1:-1].replace(f"\\{quote}", quote)
+    if text.startswith("["):
+        with suppress(ValueError):  # a list of words
+            return _text_of(json.loads(text))
+        return text
+    for number in (int, float):
+        with suppress(ValueError):
+            return _text_of(number(text))
+    return text
+
+
+def checked_options(text: str) -> str:
+    """Returns options of a command as they were typed.
+
+    Raises:
+        ValueError: They are no words of a command, such as with a quote left open.
+    """
+    options = intern(plain_text(text))
+    shlex.split(options)
+    return options
 
 
 def parsed(choices: Any) -> Choices:

@@ -15,7 +15,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from sys import intern
 from typing import Any, NamedTuple
 
 import pandas as pd
@@ -35,10 +34,15 @@ from gpmpc.studies._run_record import (
     READ_ERRORS,
     Choices,
     RunRecord,
+    checked_options,
     parsed,
+    plain_value,
 )
 
 SEED = "seed"
+UNIT = "unit"  # the variable that keeps errors of different units apart
+_UNKNOWN = "unknown"  # unit of a run without a result, where no other tells
+_SYSTEM = "system"  # the one group whose files set what is outside of the group
 _DEFAULT = "default"  # value of a setting that nobody chose and no run tells
 
 
@@ -59,7 +63,10 @@ class Report:
       ``settings`` by dotted key;
     - ``origin``: date, commit and machine; ``code``: names the code that made it, ""
       where there is none or it does not tell;
-    - ``search_options``: those of the command by which its settings were found.
+    - ``search_options``: those of the command by which its settings were found;
+      ``typed``, its own choices as they were typed, but for the seed.
+
+    Where errors are in several units, ``unit`` is a variable, too.
     """
 
     #: where it is
@@ -119,28 +126,21 @@ class Report:
     def commands(self) -> list[str]:
         """Returns the commands that fly what is missing or failed, one a cell.
 
-        Each run flies into the folder that it is in, or was asked for in. There are
-        more of a cell whose runs are of several, whose settings were found in several
-        ways, or where some runs name their seed and some have the usual one. Skipped
-        runs are not among them: a run is not flown over what lies in its folder.
+        Each run flies as it was typed, into the folder that it is in, or was asked for
+        in: what it left alone is as its settings have it, which its cell need not know.
+        There are more of a cell whose runs are of several folders, whose settings were
+        found or typed in several ways, or where some runs name their seed and some have
+        the usual one. Skipped runs are not among them: a run is not flown over what
+        lies in its folder.
         """
         to_fly = self.runs[self.runs.state.isin(("missing", "failed"))]
         commands = []
-        groups = to_fly.groupby(["cell", "sweep", "search_options", "names_seed"])
-        for (cell, sweep, options, names_seed), runs in groups:
-            varied = dict(zip(self.variables, self.cells[cell], strict=True))
-            choices = {
-                key: value
-                for key, value in (self.constants | varied).items()
-                if value != _DEFAULT
-            }
-            command = [
-                "gpmpc",
-                "run",
-                "-m",
-                *shlex.split(options),
-                *overrides_of(choices),
-            ]
+        groups = to_fly.groupby(
+            ["cell", "sweep", "search_options", "typed", "names_seed"]
+        )
+        for (_, sweep, options, overrides, names_seed), runs in groups:
+            command = ["gpmpc", "run", "-m", *shlex.split(options), *overrides]
+            # Only where all of them name it is the column the seeds that were typed.
             if names_seed:
                 command.append(f"{SEED}={','.join(runs.seed)}")
             command.append(folder_override(sweep))
@@ -235,7 +235,7 @@ class _Paths:
 
 def _planned_runs(plan: Any, folder: Path) -> list[RunRecord]:
     """Returns the runs that a sweep asked for, from the content of its plan."""
-    options = intern(plain_text(plan.get("search_options", "")))
+    options = checked_options(plan.get("search_options", ""))
     return [
         RunRecord(parsed(choices), "missing", search_options=options, planned_in=folder)
         for choices in plan["runs"]
@@ -284,7 +284,7 @@ def _put_together(
     settings' own controller, convex: ``controller`` is the variable, ("convex",) and
     ("lqr",) are the cells, and the place of each run is seed "3" of its cell.
     """
-    all_choices = _completed_choices(runs)
+    all_choices = _with_units(_completed_choices(runs), runs)
     values = _values_by_setting(all_choices)
     variables = tuple(sorted(key for key in values if len(values[key]) > 1))
     constants: Choices = {}
@@ -375,7 +375,9 @@ def _table_of(
         row = by_place[place].row()
         row["cell"] = position[place.cell]
         row["seed"] = place.seed
-        row["names_seed"] = SEED in by_place[place].choices
+        typed = dict(by_place[place].choices)
+        row["names_seed"] = typed.pop(SEED, None) is not None
+        row["typed"] = (*overrides_of(typed),)
         for name, value in row.items():
             columns.setdefault(name, []).append(value)
     types = dict.fromkeys(MEASURES, float) | {"cell": int}
@@ -383,30 +385,79 @@ def _table_of(
 
 
 def _completed_choices(runs: Sequence[RunRecord]) -> list[Choices]:
-    """Returns the choices of every run, with a value for each key that any run chose.
+    """Returns the value of every run for each setting that any run chose, and the seed.
 
-    Else the value in its own settings; a run without a file takes that of the first run
-    that left the setting alone.
+    It is what the run chose, or else what its own settings have. A run without a file
+    takes that of the first run that left the setting alone, where it must have the
+    same. One value has one spelling, however it was typed.
     """
-    keys = dict.fromkeys([*(key for run in runs for key in run.choices), SEED])
-    usual = {key: _usual_setting(runs, key) for key in keys}
+    all_chosen = [
+        {key.lstrip("+"): _chosen_value(run, key) for key in run.choices}
+        for run in runs
+    ]
+    keys = dict.fromkeys([*(key for chosen in all_chosen for key in chosen), SEED])
+    usual: dict[tuple[str, ...], str] = {}
+    for run, chosen in zip(runs, all_chosen, strict=True):
+        if run.settings:
+            for key in keys:
+                if key not in chosen:
+                    usual.setdefault(_decides(key, run), run.setting(key))
     completed = []
-    for run in runs:
+    for run, chosen in zip(runs, all_chosen, strict=True):
         others = {
-            key: run.setting(key) or usual[key] or _DEFAULT
+            key: run.setting(key) or usual.get(_decides(key, run)) or _DEFAULT
             for key in keys
-            if key not in run.choices
+            if key not in chosen
         }
-        completed.append(run.choices | others if others else run.choices)
+        completed.append(chosen | others if others else chosen)
     return completed
 
 
-def _usual_setting(runs: Iterable[RunRecord], key: str) -> str:
-    """Returns the setting of the first run that is there and did not choose."""
-    for run in runs:
-        if run.settings and key not in run.choices:
-            return run.setting(key)
-    return ""
+def _chosen_value(run: RunRecord, key: str) -> str:
+    """Returns what a run chose, as the report names it."""
+    text = run.choices[key]
+    if "${" in text:  # refers to other settings
+        return run.setting(key.lstrip("+")) or text
+    return plain_value(text)
+
+
+def _decides(key: str, run: RunRecord) -> tuple[str, ...]:
+    """Returns what decides which value a setting has that a run left alone.
+
+    The files that its command found, its system's, which sets others, and that of the
+    group which the setting is in.
+    """
+    group = key.partition(".")[0]
+    choices = run.choices
+    return key, run.search_options, choices.get(_SYSTEM, ""), choices.get(group, "")
+
+
+def _with_units(
+    all_choices: Sequence[Choices], runs: Sequence[RunRecord]
+) -> list[Choices]:
+    """Makes the unit of the errors a choice where there are several.
+
+    So no number is made of errors in two of them. A run without a result has that of
+    the others of its cell.
+    """
+    if len({run.unit for run in runs} - {""}) < 2:
+        return [*all_choices]
+    cells = [
+        frozenset(item for item in choices.items() if item[0] != SEED)
+        for choices in all_choices
+    ]
+    units: dict[frozenset[tuple[str, str]], set[str]] = {}
+    for cell, run in zip(cells, runs, strict=True):
+        if run.unit:
+            units.setdefault(cell, set()).add(run.unit)
+    with_units = []
+    for choices, cell, run in zip(all_choices, cells, runs, strict=True):
+        unit = run.unit
+        units_of_cell = units.get(cell, set())
+        if not unit and len(units_of_cell) == 1:
+            (unit,) = units_of_cell
+        with_units.append(choices | {UNIT: unit or _UNKNOWN})
+    return with_units
 
 
 def in_order(value: str) -> tuple[int, float, str]:

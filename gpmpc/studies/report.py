@@ -3,6 +3,7 @@
 Two groups of runs are compared seed by seed in ``_comparison``.
 """
 
+import json
 import os
 import re
 from collections.abc import Sequence
@@ -23,8 +24,15 @@ from gpmpc.studies._document import (
     plain_text,
     with_range,
 )
-from gpmpc.studies._run_folder import LONGEST_NAME
-from gpmpc.studies._runs import Report, in_order, overrides_of, read_report
+from gpmpc.studies._run_folder import LONGEST_NAME, is_same
+from gpmpc.studies._runs import (
+    SEED,
+    UNIT,
+    Report,
+    in_order,
+    overrides_of,
+    read_report,
+)
 
 __all__ = [
     "Comparison",
@@ -49,6 +57,7 @@ _SHORT_LABELS = {
 # What a value means, where a setting calls it otherwise.
 _WORDS = {("data.size", "null"): "all"}
 _QUARTILES = ("q25", "median", "q75")
+_MOST_DIFFERENCES = 3  # that a note shows: settings, and values of each
 _MOST_TERMINAL_ROWS = 500
 _MOST_LINES = 8  # in a figure; what is varied besides is pooled
 _LEGEND = (
@@ -117,8 +126,75 @@ def notes(report: Report) -> dict[str, list[str]]:
             reasons["Suspicious"].append(f"{folder}: {run.suspicious}")
     reasons["Skipped"] = list(report.skipped)
     reasons["Repeated"] = list(report.repeated)
+    reasons["Mixed settings"] = _mixed_settings(report)
     reasons["Mixed code"] = _mixed_code(report)
     return {kind: lines for kind, lines in reasons.items() if lines}
+
+
+def _mixed_settings(report: Report) -> list[str]:
+    """Returns a line where finished runs of one cell have different settings.
+
+    Nobody typed the difference: files of settings, or of a model, are others.
+    """
+    runs_of_cells: dict[int, list[Any]] = {}
+    for run in report.ended:
+        if run.state == "finished" and run.settings:
+            runs_of_cells.setdefault(run.cell, []).append(run)
+    counts: dict[str, dict[str, int]] = {}  # by key and value
+    for runs in runs_of_cells.values():
+        for key in _differing_settings(runs):
+            counts_of_key = counts.setdefault(key, {})
+            for run in runs:
+                value = json.dumps(run.settings.get(key))
+                counts_of_key[value] = counts_of_key.get(value, 0) + 1
+    if not counts:
+        return []
+    differences = []
+    for key in [*counts][:_MOST_DIFFERENCES]:
+        by_value = [f"{value} of {count}" for value, count in counts[key].items()]
+        shown = by_value[:_MOST_DIFFERENCES]
+        if len(by_value) > len(shown):
+            shown.append(f"{len(by_value) - len(shown)} more")
+        differences.append(f"{key} ({', '.join(shown)})")
+    if len(counts) > len(differences):
+        differences.append(f"{len(counts) - len(differences)} more settings")
+    line = (
+        "runs of one cell differ in what nobody chose on the command line, and their "
+        f"median is of different studies: {'; '.join(differences)}"
+    )
+    return [plain_text(line)]
+
+
+def _differing_settings(runs: Sequence[Any]) -> dict[str, None]:
+    """Returns the settings in which runs differ, but for what follows from the seed."""
+    first, *others = runs
+    differing: dict[str, None] = {}
+    for run in others:
+        keys = dict.fromkeys([*first.settings, *run.settings])
+        if run.settings.base is first.settings.base:
+            keys = first.settings.changes | run.settings.changes
+        for key in keys:
+            if key != SEED and _differ(first, run, key):
+                differing[key] = None
+    return differing
+
+
+def _differ(run: Any, other: Any, key: str) -> bool:
+    """Whether two runs have other values of a setting, and not by their seeds alone."""
+    value = run.settings.get(key, MISSING)
+    other_value = other.settings.get(key, MISSING)
+    if is_same(value, other_value):
+        return False
+    return not is_same(
+        _without_seed(value, run.seed), _without_seed(other_value, other.seed)
+    )
+
+
+def _without_seed(value: Any, seed: str) -> Any:
+    """Returns a value with a mark where it is the seed, or names it."""
+    if isinstance(value, str):
+        return re.sub(rf"(?<!\d){re.escape(seed)}(?!\d)", MISSING, value)
+    return MISSING if str(value) == seed else value
 
 
 def _mixed_code(report: Report) -> list[str]:
@@ -313,6 +389,8 @@ def _figures(report: Report) -> dict[str, bytes]:
     figures: dict[str, bytes] = {}
     measures = [name for name in _measures_above_zero(report) if name in _FIGURES]
     for index, variable in enumerate(report.variables):
+        if variable == UNIT:
+            continue
         for measure in measures:
             name = f"{measure}-over-{variable}"[:LONGEST_NAME]
             stem = re.sub(r"[^\w.+-]", "-", name, flags=re.ASCII)
@@ -349,14 +427,16 @@ def _figure(report: Report, index: int, measure: str) -> bytes:
 def _lines(report: Report, index: int) -> dict[str, list[int]]:
     """Groups cells by what was varied besides the variable of an index.
 
-    Where these are too many lines, the settings with the most values are pooled.
+    Where these are too many lines, the settings with the most values are pooled, but
+    never errors of different units.
 
     Returns:
         Positions of the cells of each line, by its label.
     """
     others = [i for i in range(len(report.variables)) if i != index]
     while _count_values(report, others) > _MOST_LINES:
-        others.remove(max(others, key=lambda i: _count_values(report, [i])))
+        settings = [i for i in others if report.variables[i] != UNIT]
+        others.remove(max(settings, key=lambda i: _count_values(report, [i])))
     lines: dict[str, list[int]] = {}
     for cell, values in enumerate(report.cells):
         shown = _shown(report, values)

@@ -18,6 +18,7 @@ from omegaconf import OmegaConf
 from gpmpc.cli._overrides import read_override
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import Series, over_variable
+from gpmpc.studies import report as reporting
 from gpmpc.studies._run_folder import RunFolder, folder_override
 from gpmpc.studies.report import (
     compare,
@@ -592,3 +593,91 @@ def test_a_command_names_a_folder_as_hydra_reads_it(tmp_path):
         assert read_override(word).value == str(tree)
     for name in ("1", "1e5", ".5", "true", "null", "inf"):
         assert read_override(folder_override(Path(name))).value == name
+
+
+def fly(tree, choices, unit="m", error=0.1, command="gpmpc run", **settings):
+    """Leaves a finished run whose settings hold what it chose."""
+    settings = SETTINGS | settings
+    result = metrics_of(error) | {"unit": unit}
+    made_up_run(tree, choices, settings, result=result)
+    path = folder_of(tree, choices) / "metrics.json"
+    content = json.loads(path.read_text())
+    content["provenance"]["command"] = command
+    path.write_text(json.dumps(content))
+
+
+def test_runs_of_one_cell_that_have_other_settings_are_told(tmp_path):
+    for seed in range(5):
+        choices = [f"seed={seed}"]
+        own = {"seed": seed, "model": {"seed": seed, "rows": f"rows_{seed}.csv"}}
+        own["model"]["restarts"] = 3  # which is a seed, too
+        steps = 200 if seed > 2 else 100
+        fly(tmp_path / "mixed", choices, **own, steps=steps)
+        fly(tmp_path / "alike", choices, **own)
+    assert notes(read_report(tmp_path / "alike")) == {}
+    report = read_report(tmp_path / "mixed")
+    line = "runs of one cell differ in what nobody chose on the command line, and "
+    line += "their median is of different studies: steps (100 of 3, 200 of 2)"
+    assert notes(report) == {"Mixed settings": [line]}
+    assert line in documents(report)["report.md"]
+
+
+@pytest.mark.parametrize(
+    "typed", ["gain=0", "++gain=0.0", "gain='0'", "gain=${zero}", "+gain=0e3"]
+)
+def test_one_value_is_one_cell_however_it_was_typed(typed, tmp_path):
+    for seed in range(2):
+        fly(tmp_path, [typed, f"seed={seed}"], seed=seed, gain=0)
+        fly(tmp_path, ["gain=3e-1", f"seed={seed}"], seed=seed, gain=0.3)
+    fly(tmp_path, ["seed=2"], seed=2, gain=0.0)
+    fly(tmp_path, ["gain=0.30", "seed=2"], seed=2, gain=0.3)
+    report = read_report(tmp_path)
+    assert report.variables == ("gain",)
+    assert report.cells == (("0",), ("0.3",))
+    assert [len(cell) for cell in cells(report)] == [3, 3]
+    assert compare(report, "gain=0.0", "gain=3e-1")[0].pairs == 3
+
+
+def test_what_is_missing_flies_with_the_settings_that_were_asked_for(tmp_path):
+    for seed in range(2):
+        fly(tmp_path, ["system=pendulum", f"seed={seed}"], seed=seed, horizon=30)
+        choices = ["horizon=5", "system=pendulum", f"seed={seed}"]
+        fly(tmp_path, choices, seed=seed, horizon=5)
+    plan(tmp_path, [["seed=0", "system=acrobot"], ["seed=1", "system=acrobot"]])
+    report = read_report(tmp_path)
+    # An acrobot's own horizon is not known here: it is not that of a pendulum.
+    assert ("default", "acrobot") in report.cells
+    (command,) = report.commands()
+    assert command == f"gpmpc run -m system=acrobot seed=0,1 folder={tmp_path}"
+
+
+def test_errors_of_different_units_are_in_no_common_number(tmp_path, monkeypatch):
+    for gain in range(2):
+        for i, unit in enumerate(3 * ["rad", "mol/L", "m"]):
+            system = f"system_{i}"
+            choices = [f"gain={gain}", f"system={system}"]
+            fly(tmp_path, choices, unit, gain=gain, options={"system": system})
+            # An older version measured another state, and in another unit.
+            fly(tmp_path, [*choices, "seed=1"], "m", seed=1, gain=gain)
+    report = read_report(tmp_path)
+    assert report.variables == ("gain", "system", "unit")
+    assert all(len({*cell.unit}) == 1 for cell in cells(report))
+    lines = report_document(report).csv().splitlines()
+    assert lines[0].startswith("gain,system,unit,finished")
+    series = []
+    monkeypatch.setattr(
+        reporting, "over_variable", lambda *arguments: series.append(arguments[3])
+    )
+    monkeypatch.setattr(reporting, "png", lambda figure: b"")
+    images = report_document(report).images
+    assert not [name for name in images if "over-unit" in name]
+    over_gain = [line.label for line in series[0]]
+    assert {*over_gain} == {"unit=m", "unit=mol/L", "unit=rad"}
+
+
+def test_options_that_are_no_words_of_a_command_are_told(tmp_path):
+    add(tmp_path, "lqr", 0, 0.1)
+    content = {"runs": [["seed=1"]], "search_options": "--config-dir 'x"}
+    (tmp_path / "sweep-1.json").write_text(json.dumps(content))
+    (line,) = read_report(tmp_path).skipped
+    assert line.endswith("is not what a sweep writes: ValueError: No closing quotation")
