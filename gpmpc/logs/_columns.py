@@ -14,7 +14,7 @@ import pandas as pd
 from gpmpc.exceptions import DataError
 from gpmpc.logs._file import STAMP, Tables
 from gpmpc.logs._mapping import LogMapping
-from gpmpc.logs._units import said_units, units_of, with_units
+from gpmpc.logs._units import said_units, unit_text_of_time, units_of, with_units
 
 LISTED_COLUMNS = 12  # of a table, where one is missing
 
@@ -79,8 +79,8 @@ def named_columns(path: str | Path, tables: Tables, mapping: LogMapping) -> Tabl
             f"{path}: the mapping names {len(mapping.names)} columns; there are "
             f"{len(table.columns)}"
         )
+    names_in_file = list(table.columns)
     unit_by_name = said_units(table)
-    units = [unit_by_name.get(name, "") for name in table]
     if mapping.names:
         others = table.columns[len(mapping.names) :]
         table = with_unique_names(table.set_axis([*mapping.names, *others], axis=1))
@@ -90,9 +90,30 @@ def named_columns(path: str | Path, tables: Tables, mapping: LogMapping) -> Tabl
         if (number := column_number(table, name))
     }
     by_number = {name: table.iloc[:, n - 1] for name, n in numbers.items()}
+    times = _columns_of_times(mapping)
+    numbers_of_times = {numbers[name] for name in times if name in numbers}
+    units = []
+    for number, name in enumerate(names_in_file, start=1):
+        unit = unit_by_name.get(name, "")
+        is_time = number in numbers_of_times or table.columns[number - 1] in times
+        if is_time and not unit:
+            unit = unit_text_of_time(str(name))
+        units.append(unit)
     unit_of_column = dict(zip(table.columns, units, strict=True))
     unit_of_column |= {name: units[number - 1] for name, number in numbers.items()}
     return {**tables, "": with_units(table.assign(**by_number), unit_of_column)}
+
+
+def _columns_of_times(mapping: LogMapping) -> set[str]:
+    """Returns the columns of times, as a mapping and its runs call them."""
+    names = {mapping.time, str(mapping.time_step)}
+    of_runs = {
+        column
+        for columns in mapping.runs.values()
+        for name, column in columns.items()
+        if name in names
+    }
+    return names | of_runs
 
 
 def column_number(table: pd.DataFrame, name: str) -> int:

@@ -41,10 +41,12 @@ from gpmpc.logs._file import LIST_NAMES, Tables
 from gpmpc.logs._findings import Finding
 from gpmpc.logs._formats import read_file
 from gpmpc.logs._log import Log
-from gpmpc.logs._mapping import TIME_UNITS, LogMapping
+from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._read_log import read_log
 from gpmpc.logs._regression import Standardization, fit_affine
 from gpmpc.logs._row_times import (
+    doubt_of_unit,
+    fault_of_seconds,
     read_dates,
     row_times,
     time_unit,
@@ -54,6 +56,7 @@ from gpmpc.logs._row_times import (
 from gpmpc.logs._runs import split_into_runs
 from gpmpc.logs._signals import holds_times, read_column
 from gpmpc.logs._time_step import JITTER
+from gpmpc.logs._units import TIME_UNITS
 
 EVEN = 1e-3  # of its step: a column that rises as evenly may be the time
 DRAWN = 3000  # points of a channel's line
@@ -102,6 +105,7 @@ class _Times(NamedTuple):
     stamps: Array  # (K,) [s]; the numbers of the rows where nothing says more
     column: str = ""  # that holds them
     are_rows: bool = False
+    doubt: str = ""  # about their unit, in words
 
 
 class _Clock(NamedTuple):
@@ -431,8 +435,17 @@ def _times_of(
     if dates is not None:
         return _Times(dates, column=named)
     stamps = pd.to_numeric(table[named], errors="coerce").to_numpy(float)
-    unit = unit or time_unit(table, named) or "s"
-    return _Times(stamps * TIME_UNITS[unit], column=named)
+    doubt = ""
+    try:
+        unit = unit or time_unit(str(path), table, named)
+    except DataError as error:
+        doubt = str(error)
+    times = stamps * TIME_UNITS[unit or "s"]
+    if not unit and not source.topic:  # the stamps of messages are in s
+        doubt = doubt or fault_of_seconds(times, named)
+        doubt = doubt or doubt_of_unit(table, named, unit, times)
+    is_said = mapping is not None  # by the reading with the mapping
+    return _Times(times, column=named, doubt="" if is_said else doubt)
 
 
 def _read_clock(stamps: Array) -> _Clock:
@@ -497,7 +510,7 @@ def _stream_warnings(
             "(--time COLUMN or --time-step SECONDS says more; in a mapping, time: NAME "
             "or time: {step: SECONDS})"
         ]
-    warnings = []
+    warnings = [times.doubt] if times.doubt else []
     for count, kind in (
         (clock.missing, "missing stamps"),
         (clock.repeated, "repeated stamps"),

@@ -20,14 +20,13 @@ from gpmpc.exceptions import (
 )
 from gpmpc.logs._mapping_text import load_mapping_text
 from gpmpc.logs._nominal_system import NominalSystem
-from gpmpc.logs._units import Conversion, conversion
+from gpmpc.logs._units import TIME_UNITS, Conversion, conversion
 from gpmpc.models._namings import Namings
 from gpmpc.models._state_space import StateGroup, StateSpace
 
 Role = Literal["states", "inputs", "context"]
 ROLES: tuple[Role, ...] = ("states", "inputs", "context")
 AXES = ("enu", "ned")  # of the world; the body's are then FLU or FRD
-TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _PLAIN_KEYS = (  # whose values are taken as they are
     "rate",
     "max_gap",
@@ -500,7 +499,7 @@ class LogMapping:
         keys = (*keys, _AXES_KEY, *ROLES)
         _check_keys("mapping", content, keys)
         signals = [signal for role in ROLES for signal in _read_signals(role, content)]
-        time = content.get("time") or {}
+        time = _value_or(content.get("time"), {})
         if not isinstance(time, Mapping):
             time = {"column": _as_name(time)}
         _check_keys("time", time, ("column", "unit", "step"))
@@ -511,14 +510,22 @@ class LogMapping:
             time=_as_name(time.get("column", "")),
             time_unit=time.get("unit", ""),
             time_step=time.get("step"),
-            names=_read_names("names", content.get("names") or ()),
+            names=_read_names("names", _value_or(content.get("names"), ())),
             run=_as_name(content.get("run", "")),
-            runs=_read_runs(content.get("runs") or {}),
-            keep=_read_ranges(content.get("keep") or {}),
+            runs=_read_runs(_value_or(content.get("runs"), {})),
+            keep=_read_ranges(_value_or(content.get("keep"), {})),
             axes=content.get(_AXES_KEY, ""),
-            nominal=NominalSystem.from_plain(nominal) if nominal else None,
+            nominal=None if nominal is None else NominalSystem.from_plain(nominal),
             **settings,
         )
+
+
+def _value_or(value: Any, default: Any) -> Any:
+    """Returns the value of a key, or a default where the key has none.
+
+    The number 0 is a value: somebody counts columns from it.
+    """
+    return default if value is None else value
 
 
 def _as_name(column: Any) -> Any:
@@ -556,14 +563,14 @@ def _read_runs(content: Any) -> dict[str, dict[str, str]]:
 
 def _read_signals(role: Role, content: Mapping[str, Any]) -> list[Signal]:
     """Reads the signals of one role."""
-    entries = content.get(role) or {}
+    entries = _value_or(content.get(role), {})
     _check_keys(role, entries, None)
     signals = []
     for name, entry in entries.items():
         if isinstance(entry, Sequence | int):
             entry = {"columns": entry}
         _check_keys(f"{role}.{name}", entry, _SIGNAL_KEYS)
-        columns = entry.get("columns") or ()
+        columns = _value_or(entry.get("columns"), ())
         if isinstance(columns, str | int):
             columns = (columns,)
         if not isinstance(columns, Sequence):

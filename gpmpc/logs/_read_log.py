@@ -1,7 +1,7 @@
 """Reads log files as a ``Log``: files to tables, to runs, to usable rows."""
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
 from pathlib import Path
@@ -85,8 +85,8 @@ def read_log(
     _check_content(runs, paths, findings)
     _note_unlike_entries(runs, mapping, findings)
     _note_copied_states(runs, mapping, findings)
-    _note_equal_runs(runs, findings)
-    _note_shared_rows(runs, findings)
+    equal_runs = _note_equal_runs(runs, findings)
+    _note_shared_rows(runs, equal_runs, findings)
     _note_opposite_signs(runs, mapping, findings)
     if mapping.model == "rigid_body":
         runs, remarks = read_rigid_bodies(runs, step, mapping)
@@ -276,8 +276,12 @@ def _note_copied_states(
             findings.append(Finding("copied state", runs[0].name, len(column), text))
 
 
-def _note_equal_runs(runs: Sequence[LogRun], findings: list[Finding]) -> None:
-    """Notes runs with the rows of another: one that is held out is no new one."""
+def _note_equal_runs(runs: Sequence[LogRun], findings: list[Finding]) -> set[str]:
+    """Notes runs with the rows of another: one that is held out is no new one.
+
+    Returns their names.
+    """
+    equal_runs = set()
     first_of_content: dict[bytes, str] = {}
     for run in runs:
         digest = hashlib.sha256()
@@ -290,12 +294,17 @@ def _note_equal_runs(runs: Sequence[LogRun], findings: list[Finding]) -> None:
                 "leave one of them out"
             )
             findings.append(Finding("equal runs", run.name, len(run), text))
+            equal_runs.add(run.name)
+    return equal_runs
 
 
-def _note_shared_rows(runs: Sequence[LogRun], findings: list[Finding]) -> None:
-    """Notes runs of which a part is in an earlier one, as in files that overlap.
+def _note_shared_rows(
+    runs: Sequence[LogRun], equal_runs: Collection[str], findings: list[Finding]
+) -> None:
+    """Notes runs of which rows are in an earlier one, as in files that overlap.
 
-    Rows are the same where their times and all values are.
+    Rows are the same where their times and all values are. Runs that equal another have
+    a finding of their own.
     """
     keys = np.concatenate([_row_keys(run) for run in runs])
     numbers = np.repeat(np.arange(len(runs)), [len(run) for run in runs])
@@ -303,7 +312,7 @@ def _note_shared_rows(runs: Sequence[LogRun], findings: list[Finding]) -> None:
     first_runs = numbers[first_rows][indices]
     for number, run in enumerate(runs):
         of_others = first_runs[(numbers == number) & (first_runs < number)]
-        if len(of_others) < FEWEST_SHARED or len(of_others) == len(run):
+        if len(of_others) < FEWEST_SHARED or run.name in equal_runs:
             continue
         other = runs[int(np.bincount(of_others).argmax())].name
         text = (

@@ -6,26 +6,65 @@ import pandas as pd
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
 from gpmpc.logs._file import STAMP
-from gpmpc.logs._mapping import TIME_UNITS, LogMapping
+from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._signals import holds_times, read_column, seconds
-from gpmpc.logs._units import unit_at_end, unit_in_name, units_of
+from gpmpc.logs._units import (
+    TIME_UNITS,
+    is_no_unit,
+    unit_in_name,
+    unit_of_time,
+    unit_text_of_time,
+    units_of,
+)
 
-# columns that hold the time where nobody says which
-TIMES = (STAMP, "timestamp", "t", "time", "stamp", "Time", "seconds")
+# columns that hold the time where nobody says which, in small or large letters; but T
+# is rather a temperature
+TIMES = (
+    STAMP,
+    *("timestamp", "t", "time", "stamp", "seconds", "datetime", "elapsed"),
+    *("zeit", "zeitstempel"),
+)
+_SAMPLE = 50  # rows in which texts are looked at: are they dates?
 LATEST_UNSTATED = 1e11  # [s] since 1970, in the year 5138
 LONGEST_UNSTATED = 3600.0  # [s] between rows whose stamps nobody gave a unit
 EARLIEST_DATE = 1e9  # [s] since 1970: stamps from there on are rather in s
 
 
-def time_unit(table: pd.DataFrame, column: str) -> str:
+def time_unit(where: str, table: pd.DataFrame, column: str) -> str:
     """Returns the unit of a column of times that the file says; empty for none.
+
+    Args:
+        where: Names the table, for errors.
+        table: That has the column.
+        column: Its name.
+
+    Raises:
+        DataError: What the file says is no unit of times.
+    """
+    text = unit_text(table, column)
+    unit = unit_of_time(text)
+    if text and not unit:
+        raise DataError(
+            f"{where}: the file says {text!r} of the unit of {column}, which is no "
+            f"unit of times: in which is it? (time: {{column: {column}, unit: ms}}, "
+            f"or {_units_but('ms')})"
+        )
+    return unit
+
+
+def unit_text(table: pd.DataFrame, column: str) -> str:
+    """Returns what a file says of the unit of a column of times; empty for nothing.
 
     It stands in a line of units, or in the column's name.
     """
     stated = units_of(table).get(column, "")
-    if stated in TIME_UNITS:
-        return stated
-    return unit_in_name(column) or unit_at_end(column)
+    text = unit_text_of_time(column) if is_no_unit(stated) else stated
+    return "" if is_no_unit(text) else text
+
+
+def _units_but(unit: str) -> str:
+    """Lists the units of times but for one that an example has."""
+    return ", ".join(other for other in TIME_UNITS if other != unit)
 
 
 def usual_time_column(table: pd.DataFrame) -> str:
@@ -33,14 +72,24 @@ def usual_time_column(table: pd.DataFrame) -> str:
 
     A date that is the same in all rows, as of when the file was made, is no time.
     """
-    for name in TIMES:
-        if name in table:
-            return name
-    for name in map(str, table):
+    columns = [str(name) for name in table]
+    for time in TIMES:
+        for name in columns:
+            is_in_large = len(name) > 1 and name.casefold() == time
+            if name == time or is_in_large:
+                return name
+    for name in columns:
         if unit_in_name(name):
             return name
-    dates = (str(name) for name in table if holds_times(table, name))
+    dates = (str(name) for name in table if _begins_with_dates(table, name))
     return next((name for name in dates if table[name].nunique() > 1), "")
+
+
+def _begins_with_dates(table: pd.DataFrame, column: str) -> bool:
+    """Tells whether a column holds dates, also as texts in its first rows."""
+    if holds_times(table, column):
+        return True
+    return read_dates(table.head(_SAMPLE), column) is not None
 
 
 def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array:
@@ -54,8 +103,8 @@ def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array
             what the file says (see ``time_unit``), or s.
 
     Raises:
-        DataError: The column is missing, or holds something else, or rows are hours
-            apart in a unit that nobody stated.
+        DataError: The column is missing, or holds something else, or its unit is
+            unknown, or rows are hours apart in a unit that nobody stated.
     """
     dates = read_dates(table, column) if column in table else None
     if dates is not None:
@@ -70,28 +119,29 @@ def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array
         raise DataError(f"{error}; {hint}") from error
     if holds_times(table, column):
         return times
-    stated = unit or time_unit(table, column)
+    stated = unit or time_unit(where, table, column)
     times = times * TIME_UNITS[stated or "s"]
-    if not stated:
-        _check_unstated_unit(where, times, column)
+    fault = "" if stated else fault_of_seconds(times, column)
+    if fault:
+        raise DataError(f"{where}: {fault}")
     return times
 
 
-def _check_unstated_unit(where: str, times: Array, column: str) -> None:
-    """Raises ``DataError`` of times (K,) [s] that are rather of a smaller unit."""
+def fault_of_seconds(times: Array, column: str) -> str:
+    """Says that times (K,) are rather of a smaller unit than s; empty otherwise."""
     steps = np.diff(times[np.isfinite(times)])
     if not len(steps):
-        return
+        return ""
     step = np.median(steps)
     if step > LONGEST_UNSTATED:
         doubt = f"rows are {step:.3g} s apart"
     elif np.nanmedian(times) > LATEST_UNSTATED:
         doubt = "rows are of a year after 5000"
     else:
-        return
-    raise DataError(
-        f"{where}: {doubt} if {column} is in s: in which unit is it? (time: {{column: "
-        f"{column}, unit: us}}, or s, ms, ns)"
+        return ""
+    return (
+        f"{doubt} if {column} is in s: in which unit is it? (time: {{column: "
+        f"{column}, unit: us}}, or {_units_but('us')})"
     )
 
 
@@ -100,7 +150,7 @@ def doubt_of_unit(table: pd.DataFrame, column: str, unit: str, times: Array) -> 
 
     They may where nobody stated one and they are whole numbers, as a counter of ms is.
     """
-    is_stated = unit or time_unit(table, column) or holds_times(table, column)
+    is_stated = unit or unit_text(table, column) or holds_times(table, column)
     times = times[np.isfinite(times)]
     steps = np.abs(np.diff(times))
     if is_stated or not len(steps) or times.max() > EARLIEST_DATE:
@@ -150,7 +200,7 @@ def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | N
     if step is not None:
         unit = mapping.time_unit
         if isinstance(mapping.time_step, str):
-            unit = unit or time_unit(table, mapping.time_step)
+            unit = unit or time_unit(where, table, mapping.time_step)
         return _steps_from_first(table) * step * TIME_UNITS[unit or "s"]
     if mapping.rate and not unread_times(table, mapping):
         return _steps_from_first(table) / mapping.rate
@@ -162,7 +212,8 @@ def unread_times(table: pd.DataFrame, mapping: LogMapping) -> str:
 
     One that is a signal, such as t of a temperature, is no time.
     """
-    others = [name for name in table if name not in mapping.signal_columns]
+    read = {*mapping.signal_columns, mapping.run}
+    others = [name for name in table if name not in read]
     return usual_time_column(table[others])
 
 

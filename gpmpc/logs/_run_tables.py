@@ -30,9 +30,15 @@ from gpmpc.logs._resampling import (
     grid_of_rows,
     resample,
 )
-from gpmpc.logs._row_times import doubt_of_unit, read_times, row_times, unread_times
+from gpmpc.logs._row_times import (
+    doubt_of_unit,
+    read_times,
+    row_times,
+    unit_text,
+    unread_times,
+)
 from gpmpc.logs._signals import nan_zero_dropouts, read_column, read_signal
-from gpmpc.logs._units import conversion, is_known, units_of
+from gpmpc.logs._units import conversion, is_known, unit_of_time, units_of
 
 MANY_REPEATS = 0.2  # of the rows that stay: stamps that are rounded repeat as often
 USUAL_GAP = 1.5  # time steps; a longer one is a gap where the mapping names none
@@ -206,24 +212,57 @@ def _read_time(
     findings: RunFindings,
 ) -> Array:
     """Reads the stamps (K,) [s] of a table, in the order of the file."""
-    if mapping.time:
-        times = read_times(where, table, mapping.time, mapping.time_unit)
-        doubt = doubt_of_unit(table, mapping.time, mapping.time_unit, times)
-        findings.add("unit of the time", len(times) if doubt else 0, doubt)
-        return times
-    stamps = row_times(where, table, mapping)
-    if stamps is not None:
-        return stamps
-    column = STAMP if STAMP in table else "timestamp"
-    if column not in table:
-        raise DataError(f"{where}: {_without_times(table, mapping)}")
-    if topic and mapping.time_unit not in ("", "s"):
-        raise SettingError(
-            "time.unit",
-            "needs the column that it is of: the stamps of messages are in s; got "
-            f"{mapping.time_unit!r} alone",
-        )
-    return read_times(where, table, column, mapping.time_unit)
+    column = mapping.time
+    if not column:
+        counted = row_times(where, table, mapping)
+        if counted is not None:
+            _note_counted_rows(len(counted), mapping, findings)
+            return counted
+        column = STAMP if STAMP in table else "timestamp"
+        if column not in table:
+            raise DataError(f"{where}: {_without_times(table, mapping)}")
+        if topic and mapping.time_unit not in ("", "s"):
+            raise SettingError(
+                "time.unit",
+                "needs the column that it is of: the stamps of messages are in s; got "
+                f"{mapping.time_unit!r} alone",
+            )
+    times = read_times(where, table, column, mapping.time_unit)
+    if mapping.time or not topic:  # the stamps of messages are in s
+        _note_unit_of_time(table, column, mapping.time_unit, times, findings)
+    return times
+
+
+def _note_counted_rows(rows: int, mapping: LogMapping, findings: RunFindings) -> None:
+    """Notes rows whose step nobody stated but by the rate."""
+    if mapping.time_step is not None or not mapping.rate:
+        return
+    text = (
+        f"no column is called as times are, or holds dates: {rows} rows are taken as "
+        f"{1 / mapping.rate:.3g} s apart, by the rate (time: {{column: NAME}} names "
+        "one)"
+    )
+    findings.add("no times", rows, text)
+
+
+def _note_unit_of_time(
+    table: pd.DataFrame, column: str, unit: str, times: Array, findings: RunFindings
+) -> None:
+    """Notes a unit of the time that nobody stated, or of which the file says another.
+
+    Args:
+        table: With K rows.
+        column: That holds their times.
+        unit: That the mapping states; may be empty.
+        times: As they were read (K,) [s].
+        findings: Of the run.
+    """
+    doubt = doubt_of_unit(table, column, unit, times)
+    findings.add("unit of the time", len(times) if doubt else 0, doubt)
+    said = unit_of_time(unit_text(table, column))
+    is_other = bool(unit and said and said != unit)
+    text = f"the file says other units than the mapping: {column} in {said} (taken as "
+    findings.add("unit", int(is_other), f"{text}{unit})")
 
 
 def _without_times(table: pd.DataFrame, mapping: LogMapping) -> str:

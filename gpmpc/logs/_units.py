@@ -33,6 +33,7 @@ SYMBOLS = {
     "s": Conversion("s", 1.0),
     "ms": Conversion("s", 1e-3),
     "us": Conversion("s", 1e-6),
+    "ns": Conversion("s", 1e-9),
     "min": Conversion("s", 60.0),
     "h": Conversion("s", 3600.0),
     "Hz": Conversion("Hz", 1.0),
@@ -61,15 +62,45 @@ SYMBOLS = {
     "rpm": Conversion("rad/s", float(np.pi / 30)),
     "g": Conversion("m/s2", 9.80665),  # standard gravity, not the gram
 }
+TIME_UNITS = {  # of the times of rows [s]
+    "s": 1.0,
+    "ms": 1e-3,
+    "us": 1e-6,
+    "ns": 1e-9,
+    "min": 60.0,
+    "h": 3600.0,
+    "d": 86400.0,
+}
+_TIME_WORDS = {  # for units of time, in small letters
+    word: unit
+    for unit, words in {
+        "s": "sec secs second seconds sekunden",
+        "ms": "msec msecs millis millisecond milliseconds",
+        "us": "usec usecs micros microsecond microseconds",
+        "ns": "nsec nsecs nanos nanosecond nanoseconds",
+        "min": "mins minute minutes minuten",
+        "h": "hr hrs hour hours stunden",
+        "d": "day days tage",
+    }.items()
+    for word in words.split()
+}
+# Greek's mu and the sign of micro look alike
+_SIGNS = {
+    "\N{DEGREE SIGN}": "deg",
+    "\N{MICRO SIGN}": "u",
+    "\N{GREEK SMALL LETTER MU}": "u",
+}
 _NO_UNIT = ("", "1", "-")
 _UNITS_KEY = "units"  # in the ``attrs`` of a table
-# names of times that say their unit: "Time [ms]", "time (us)", "t_s"; TimeUS is
+# names of times that say their unit: "Time [ms]", "time (usec)", "t_s"; TimeUS is
 # ArduPilot's
 _TIME_WITH_UNIT = re.compile(
-    r"(?:[Tt]ime|[Tt]imestamp|t)(?: ?[\[(](s|ms|us|ns)[\])]|_(s|ms|us|ns))"
+    r"(?:[Tt]imestamp|[Tt]ime|TIME|t|[Zz]eit)"
+    r"(?: ?[\[(]([^\[\]()]+)[\])]|_(s|ms|us|ns|[mun]?secs?))"
 )
 _TIMES_BY_NAME = {"TimeUS": "us", "millis": "ms", "micros": "us"}  # and their units
-_ENDS_WITH_UNIT = re.compile(r".*_(ms|us|ns|msec|usec|nsec)")  # time_boot_ms
+# time_boot_ms, Zeit/min, time in s
+_ENDS_WITH_UNIT = re.compile(r".*\S(?:_| ?/ ?| in )([^\W\d_]+)")
 _NAME_WITH_UNIT = re.compile(r".*\S ?(?:\[([^\[\]]+)\]|\(([^()]+)\))")
 _FACTOR = re.compile(r"([A-Za-z%]+)\^?((?:-?\d)?)")
 
@@ -86,11 +117,12 @@ def conversion(key: str, unit: str) -> Conversion:
     """
     if not isinstance(unit, str):
         raise SettingError(key, f"must be the name of a unit; got {unit!r}")
-    if unit.strip() in _NO_UNIT:
+    if is_no_unit(unit):
         return Conversion("", 1.0)
-    if unit in SYMBOLS:
-        return SYMBOLS[unit]
-    numerator, *denominators = unit.split("/")
+    symbols = _as_symbols(unit)
+    if symbols in SYMBOLS:
+        return SYMBOLS[symbols]
+    numerator, *denominators = symbols.split("/")
     product = _product(key, unit, numerator)
     for denominator in denominators:
         divisor = _product(key, unit, denominator)
@@ -98,6 +130,33 @@ def conversion(key: str, unit: str) -> Conversion:
             f"{product.unit}/{divisor.unit}", product.factor / divisor.factor
         )
     return product
+
+
+def _as_symbols(unit: str) -> str:
+    """Writes a unit in ``SYMBOLS``: msec as ms, and signs by letters."""
+    for sign, letters in _SIGNS.items():
+        unit = unit.replace(sign, letters)
+    return re.sub("[A-Za-z]+", lambda word: _as_time_symbol(word[0]), unit)
+
+
+def _as_time_symbol(word: str) -> str:
+    """Returns the symbol of a unit of time that is written out; others as they are."""
+    return _TIME_WORDS.get(word.casefold(), word)
+
+
+def unit_of_time(text: str) -> str:
+    """Returns the unit of ``TIME_UNITS`` that a text means; empty where it is none.
+
+    >>> unit_of_time("msec"), unit_of_time("Hours"), unit_of_time("left")
+    ('ms', 'h', '')
+    """
+    symbols = _as_symbols(text.strip())
+    return symbols if symbols in TIME_UNITS else ""
+
+
+def is_no_unit(text: str) -> bool:
+    """Tells whether a text stands for a number without a unit."""
+    return text.strip() in _NO_UNIT
 
 
 def is_known(unit: str) -> bool:
@@ -118,27 +177,44 @@ def unit_in_name(column: str) -> str:
     if column in _TIMES_BY_NAME:
         return _TIMES_BY_NAME[column]
     match = _TIME_WITH_UNIT.fullmatch(column)
-    return (match[1] or match[2]) if match is not None else ""
+    return unit_of_time(match[1] or match[2]) if match is not None else ""
 
 
-def unit_at_end(time: str) -> str:
-    """Returns the unit at the end of the name of what is a time; empty for none.
+def unit_text_of_time(time: str) -> str:
+    """Returns what the name of a time says of its unit, as it is written there.
 
-    >>> unit_at_end("time_boot_ms"), unit_at_end("time_usec"), unit_at_end("items")
-    ('ms', 'us', '')
+    In brackets that may be any word.
+
+    >>> unit_text_of_time("elapsed (msec)"), unit_text_of_time("time_boot_ms")
+    ('msec', 'ms')
+    >>> unit_text_of_time("Zeit/min"), unit_text_of_time("items")
+    ('min', '')
     """
+    if time in _TIMES_BY_NAME:
+        return _TIMES_BY_NAME[time]
+    if text := _text_in_brackets(time):
+        return text
     match = _ENDS_WITH_UNIT.fullmatch(time)
-    return match[1].removesuffix("ec") if match is not None else ""
+    is_unit = match is not None and match[1] != "d" and unit_of_time(match[1])
+    return match[1] if match is not None and is_unit else ""
+
+
+def _text_in_brackets(name: str) -> str:
+    """Returns the text in brackets at the end of a name; empty for an index."""
+    match = _NAME_WITH_UNIT.fullmatch(name)
+    text = (match[1] or match[2]).strip() if match is not None else ""
+    return "" if text.isdecimal() else text
 
 
 def unit_in_brackets(name: str) -> str:
     """Returns the unit at the end of a column's name; empty where there is none.
 
-    >>> unit_in_brackets("speed [km/h]"), unit_in_brackets("motor (left)")
+    A number there is that of an entry of a list.
+
+    >>> unit_in_brackets("speed [km/h]"), unit_in_brackets("motor[1]")
     ('km/h', '')
     """
-    match = _NAME_WITH_UNIT.fullmatch(name)
-    unit = (match[1] or match[2]).strip() if match is not None else ""
+    unit = _text_in_brackets(name)
     return unit if is_known(unit) else ""
 
 

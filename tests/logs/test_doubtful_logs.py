@@ -382,11 +382,16 @@ def test_rows_that_two_files_share_are_noted(tmp_path):
         written(tmp_path, table[:400], "a.csv"),
         written(tmp_path, table[350:], "b.csv"),
         written(tmp_path, table.assign(x=1.1 * table["x"]), "c.csv"),
+        written(tmp_path, table[100:200], "part.csv"),
+        written(tmp_path, table[100:200], "same.csv"),
     ]
     log = read_log(files, MAPPING)
-    (finding,) = log.findings
-    assert (finding.kind, finding.run, finding.count) == ("shared rows", "b", 50)
-    assert finding.text.startswith(
+    assert [(f.kind, f.run, f.count) for f in log.findings] == [
+        ("equal runs", "same", 100),
+        ("shared rows", "b", 50),
+        ("shared rows", "part", 100),
+    ]
+    assert log.findings[1].text.startswith(
         "50 of 250 rows are in earlier runs, such as a: held"
     )
 

@@ -317,11 +317,16 @@ def test_rows_that_a_run_lacks_took_time_as_well(tmp_path, time, runs, pieces):
     } == pieces
 
 
-@pytest.mark.parametrize("name", ["t", "time", "Time [s]", "time (us)", "TimeUS"])
+@pytest.mark.parametrize(
+    "name",
+    ["t", "time", "Time [s]", "time (us)", "TimeUS", "TIME", "Zeit [min]", "Datum"],
+)
 def test_rows_of_a_rate_are_not_counted_where_a_column_is_called_as_times_are(
     tmp_path, name
 ):
     table = strange.pendulum(ROWS).rename(columns={"t": name})
+    if name == "Datum":  # no name of times, but dates
+        table[name] = pandas.to_datetime(BEGIN + table[name], unit="s")
     table.to_csv(tmp_path / "arm.csv", index=False)
     signals = {key: TABLE_MAPPING[key] for key in ("states", "inputs")}
     with pytest.raises(DataError, match="is called as times are.*time: {step: 0.02}"):
@@ -339,43 +344,90 @@ def test_the_date_of_a_file_is_no_time_of_its_rows(tmp_path):
     table.to_parquet(tmp_path / "arm.parquet")
     signals = {key: TABLE_MAPPING[key] for key in ("states", "inputs")}
     log = read_log(tmp_path / "arm.parquet", {**signals, "rate": 50})
-    assert len(log) == ROWS
+    assert (len(log), kinds(log)) == (ROWS, {"no times": ROWS})
+    assert "400 rows are taken as 0.02 s apart, by the rate" in texts(log)
 
 
 SIGNALS = {"states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
 
 
 @pytest.mark.parametrize(
-    ("header", "mapping"),
+    ("header", "mapping", "step"),
     [
-        ("t,x,u\nms,m,N\n", {"time": "t", **SIGNALS}),
-        ("t,x,u\n(ms),(m),(N)\n\n", {"time": "t", **SIGNALS}),
-        ("t_ms,x,u\n", {"time": 1, **SIGNALS}),
-        ("millis,x,u\n", {"time": "millis", **SIGNALS}),
-        ("time_boot_ms,x,u\n", {"time": "time_boot_ms", **SIGNALS}),
-        ("elapsed_msec,x,u\n", {"time": "elapsed_msec", **SIGNALS}),
-        ("t_ms,x,u\n", {"time": "t", "names": ["t"], **SIGNALS}),
-        ("t [ms],x,u\n", {"time": "T", "runs": {"a": {"T": "t [ms]"}}, **SIGNALS}),
+        ("t,x,u\nms,m,N\n", {"time": "t", **SIGNALS}, 0.02),
+        ("t,x,u\n(ms),(m),(N)\n\n", {"time": "t", **SIGNALS}, 0.02),
+        ("t_ms,x,u\n", {"time": 1, **SIGNALS}, 0.02),
+        ("millis,x,u\n", {"time": "millis", **SIGNALS}, 0.02),
+        ("time_boot_ms,x,u\n", {"time": "time_boot_ms", **SIGNALS}, 0.02),
+        ("elapsed_msec,x,u\n", {"time": "elapsed_msec", **SIGNALS}, 0.02),
+        ("t_ms,x,u\n", {"time": "t", "names": ["t"], **SIGNALS}, 0.02),
+        ("t [ms],x,u\n", {"time": "T", "runs": {"": {"T": "t [ms]"}}, **SIGNALS}, 0.02),
+        ("time (msec),x,u\n", {"time": 1, **SIGNALS}, 0.02),
+        ("Zeit [ms],x,u\n", {"time": 1, **SIGNALS}, 0.02),
+        ("Zeit/ms,x,u\n", {"time": 1, **SIGNALS}, 0.02),
+        ("t,x,u\nmsec,m,N\n", {"time": "t", **SIGNALS}, 0.02),
+        ("t,x,u\nns,m,N\n", {"time": "t", **SIGNALS}, 20e-9),
+        ("Time [\N{MICRO SIGN}s],x,u\n", {"time": 1, **SIGNALS}, 20e-6),
+        ("elapsed (microseconds),x,u\n", {"time": 1, **SIGNALS}, 20e-6),
+        ("time [min],x,u\n", {"time": 1, **SIGNALS}, 1200),
+        ("t,x,u\nh,m,N\n", {"time": "t", **SIGNALS}, 72_000),
+        ("t,x,u\n", {"time": {"column": "t", "unit": "d"}, **SIGNALS}, 1_728_000),
     ],
 )
-def test_the_unit_that_a_file_says_of_its_times_is_taken(tmp_path, header, mapping):
+def test_the_unit_that_a_file_says_of_its_times_is_taken(
+    tmp_path, header, mapping, step
+):
     rows = [f"{20 * k},{k % 7},{k % 3}\n" for k in range(60)]
     (tmp_path / "a.csv").write_text(header + "".join(rows))
     log = read_log(tmp_path / "a.csv", mapping)
-    assert log.time_step == pytest.approx(0.02)
-    assert not kinds(log)
+    assert log.time_step == pytest.approx(step)
+    assert not kinds(log).keys() - {"time step"}  # a short one, or a long one
+    if isinstance(mapping["time"], str | int):
+        inspection = inspect_log(tmp_path / "a.csv", time="1")
+        assert inspection.streams["rate [Hz]"][0] == pytest.approx(1 / step)
 
 
-def test_whole_numbers_without_a_unit_are_noted(tmp_path):
+@pytest.mark.parametrize("header", ["time (left),x,u\n", "t,x,u\nV,m,N\n"])
+def test_what_is_no_unit_of_times_is_asked_for(tmp_path, header):
+    rows = [f"{0.02 * k},{k % 7},{k % 3}\n" for k in range(60)]
+    (tmp_path / "a.csv").write_text(header + "".join(rows))
+    with pytest.raises(DataError, match="which is no unit of times: in which is it"):
+        read_log(tmp_path / "a.csv", {"time": 1, **SIGNALS})
+    assert "no unit of times" in inspect_log(tmp_path / "a.csv", time="1").warnings[0]
+    stated = {"time": {"column": 1, "unit": "s"}, **SIGNALS}
+    assert read_log(tmp_path / "a.csv", stated).time_step == pytest.approx(0.02)
+
+
+def test_another_unit_of_the_time_than_the_mapping_states_is_noted(tmp_path):
     rows = [f"{20 * k},{k % 7},{k % 3}\n" for k in range(60)]
-    (tmp_path / "a.csv").write_text("t,x,u\n" + "".join(rows))
-    log = read_log(tmp_path / "a.csv", {"time": "t", **SIGNALS})
-    assert kinds(log) == {"unit of the time": 60}
-    assert "rows are taken as 20 s apart; of ms, state time: {column: t, unit" in texts(
-        log
+    (tmp_path / "a.csv").write_text("t [ms],x,u\n" + "".join(rows))
+    log = read_log(
+        tmp_path / "a.csv", {"time": {"column": "t [ms]", "unit": "s"}, **SIGNALS}
     )
-    stated = {"time": {"column": "t", "unit": "s"}, **SIGNALS}
+    assert "than the mapping: t [ms] in ms (taken as s)" in texts(log)
+
+
+@pytest.mark.parametrize(("name", "time"), [("t", {"time": "t"}), ("timestamp", {})])
+def test_whole_numbers_without_a_unit_are_noted(tmp_path, name, time):
+    rows = [f"{20 * k},{k % 7},{k % 3}\n" for k in range(60)]
+    (tmp_path / "a.csv").write_text(f"{name},x,u\n" + "".join(rows))
+    log = read_log(tmp_path / "a.csv", {**time, **SIGNALS})
+    assert kinds(log) == {"unit of the time": 60}
+    doubt = f"rows are taken as 20 s apart; of ms, state time: {{column: {name}, unit"
+    assert doubt in texts(log)
+    assert doubt in " ".join(inspect_log(tmp_path / "a.csv").warnings)
+    stated = {"time": {"column": name, "unit": "s"}, **SIGNALS}
     assert not kinds(read_log(tmp_path / "a.csv", stated))
+
+
+def test_a_column_that_is_counted_from_zero_is_missing(tmp_path):
+    (tmp_path / "a.csv").write_text("k,x,u\n0,1,2\n1,2,3\n2,3,5\n")
+    with pytest.raises(DataError, match="column '0' is missing"):
+        read_log(tmp_path / "a.csv", {"time": 0, "rate": 10, **SIGNALS})
+    with pytest.raises(DataError, match="column '0' is missing"):
+        read_log(
+            tmp_path / "a.csv", {"time": {"step": 1}, **SIGNALS, "states": {"x": 0}}
+        )
 
 
 def test_stamps_of_a_far_year_are_in_another_unit(tmp_path):
