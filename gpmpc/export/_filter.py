@@ -26,7 +26,12 @@ class Estimator(NamedTuple):
 
 
 def check_estimator(controller: GPMPC, estimator: Any) -> None:
-    """Raises ``SettingError`` of the first part of a filter that C cannot hold."""
+    """Raises an error of the first part of a filter that C cannot hold.
+
+    Raises:
+        SettingError: A part of another kind, or of other states or inputs.
+        ShapeError: A belief or a measurement of other sizes.
+    """
     check_kind("estimator", estimator, Estimator, "Estimator(filter, belief)")
     kalman = estimator.filter
     if type(kalman) is not KalmanFilter:
@@ -41,13 +46,17 @@ def check_estimator(controller: GPMPC, estimator: Any) -> None:
     if kalman.model.state_dim != n:
         rule = f"must estimate the {n} states of the controller"
         raise SettingError("filter.model", f"{rule}; got {kalman.model.state_dim}")
+    m = controller.prediction.input_dim
+    if kalman.model.input_dim != m:
+        rule = f"must take the {m} inputs of the controller"
+        raise SettingError("filter.model", f"{rule}; got {kalman.model.input_dim}")
     check_kind("belief", estimator.belief, Gaussian, "a Gaussian")
     if estimator.belief.mean.shape != (n,):
         got = tuple(estimator.belief.mean.shape)
         raise ShapeError(f"the estimator's belief must be of {n} states; got {got}")
     check_like("belief", estimator.belief.mean, kalman.model)
     if kalman.measurement.measured_states is None:
-        _tape_of(kalman.measurement.function)
+        _check_function(kalman.measurement)
 
 
 class FilterWriter:
@@ -94,20 +103,25 @@ class FilterWriter:
         self.text = "\n".join(pieces)
 
 
-def _tape_of(function: Any) -> Any:
-    """Returns the operations of a function of the state.
+def _check_function(measurement: Measurement) -> None:
+    """Raises an error unless C can compute what a measurement shows of the state.
 
     Raises:
         SettingError: It is no CasADi function of elementary operations.
+        ShapeError: It takes, or gives, another number of entries.
     """
-    tape = getattr(function, "tape", None)
-    if not isinstance(function, CasadiFunction) or tape is None:
+    function = measurement.function
+    if not isinstance(function, CasadiFunction) or function.tape is None:
         raise SettingError(
             "measurement.function",
             "an exported one is Measurement.of_states, or a CasadiFunction of "
             f"elementary operations; got {type(function).__name__}",
         )
-    return tape
+    n = measurement.state_dim
+    p = measurement.output_dim
+    if function.sizes != [n] or function.shape != (p, 1):
+        rule = f"the function of a measurement must map ({n},) to ({p},)"
+        raise ShapeError(f"{rule}; got {function.function}")
 
 
 def _measurement_function(measurement: Measurement, numbers: Numbers) -> str:
@@ -120,7 +134,8 @@ def _measurement_function(measurement: Measurement, numbers: Numbers) -> str:
             body.append(f"value[{i}] = x[{state}];")
             body.append(f"jacobian[{i * n + state}] = 1;")
     else:
-        graph, value = graph_of_tape(_tape_of(measurement.function))
+        function_of_state: Any = measurement.function
+        graph, value = graph_of_tape(function_of_state.tape)
         names = [f"x[{i}]" for i in range(n)]
         body += expansion_lines(graph, value, names, numbers)
     return function(_SIGNATURE, body, "h(x): what the sensors show")

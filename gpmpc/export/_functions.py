@@ -18,11 +18,12 @@ class FunctionWriter:
     """Writes the functions that a controller linearises along its plans.
 
     Attributes:
-        parameters: How many parameters they take, q.
         text: All that was written.
 
     Raises:
         SettingError: One of them is no CasADi function of elementary operations.
+        ShapeError: One takes others of states and inputs, or gives more or fewer
+            values than it says; or two take other numbers of parameters.
     """
 
     def __init__(self, controller: GPMPC, numbers: Numbers):
@@ -31,12 +32,17 @@ class FunctionWriter:
         self._m = controller.prediction.input_dim
         self._horizon = controller.horizon
         self._parts: list[str] = []
-        self.parameters = 0
+        self._parameters: int | None = None  # none takes some so far
         if controller.prediction.constraints.smooth:
             self._write_constraints(controller)
         if controller.problem.outputs:
             self._write_outputs(controller.problem.outputs)
         self.text = "\n".join(self._parts)
+
+    @property
+    def parameters(self) -> int:
+        """How many parameters the functions take, q."""
+        return self._parameters or 0
 
     def _write_constraints(self, controller: GPMPC) -> None:
         """Writes h(x, u, p) of all rows, with their gradients."""
@@ -112,15 +118,15 @@ class FunctionWriter:
         if wrapped.tape is None:
             rule = "an exported function is made of elementary operations"
             raise SettingError(key, f"{rule}; got {smooth}")
+        self._check_sizes(key, wrapped, count)
         inputs: list[str] = []
         columns: list[int] = []
         first_columns = (0, self._n, self._n + self._m)
+        # functions of the state alone, or of state and input, are shorter
         arguments = zip("xup", first_columns, wrapped.sizes, strict=False)
         for argument, first, size in arguments:
             inputs += [f"{argument}[{i}]" for i in range(size)]
             columns += range(first, first + size)
-        if len(wrapped.sizes) > 2:
-            self.parameters = max(self.parameters, wrapped.sizes[2])
         graph, value = graph_of_tape(wrapped.tape)
         lines = expansion_lines(
             graph,
@@ -140,6 +146,18 @@ class FunctionWriter:
             [*unused("xup", lines), f"fill(jacobian, 0, {size});", *lines],
             note,
         )
+
+    def _check_sizes(self, key: str, function: CasadiFunction, count: int) -> None:
+        """Raises ``ShapeError`` unless the arrays of C hold arguments and values."""
+        sizes = function.sizes
+        if self._parameters is None and len(sizes) == 3:
+            self._parameters = sizes[2]
+        taken = [self._n, self._m, self._parameters]
+        if sizes != taken[: len(sizes)] or function.shape != (count, 1):
+            rule = f"{key} must map x ({self._n},), u ({self._m},)"
+            if self._parameters is not None:
+                rule = f"{rule}, p ({self._parameters},)"
+            raise ShapeError(f"{rule} to ({count},); got {function.function}")
 
     def _function(self, signature: str, body: Sequence[str], note: str) -> None:
         """Writes a function, what it computes above it."""

@@ -31,13 +31,18 @@ _NAME = "gpmpc"
 #: In every file that is written, and in no other.
 MARK = "Written by gpmpc; the next export overwrites it."
 _PREFIX = re.compile(r"(?<![A-Za-z])gpmpc(?=_|\.[ch]\b)")
+_COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 # a header of such a name, or a target of such a name, would hide another one
 _TAKEN = frozenset(
     {
         *("assert", "complex", "ctype", "errno", "fenv", "float", "inttypes"),
-        *("iso646", "limits", "locale", "math", "setjmp", "signal", "stdarg"),
-        *("stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath"),
-        *("time", "wchar", "wctype"),
+        *("iso646", "limits", "locale", "math", "setjmp", "signal", "stdalign"),
+        *("stdarg", "stdatomic", "stdbool", "stddef", "stdint", "stdio", "stdlib"),
+        *("stdnoreturn", "string", "tgmath", "threads", "time", "uchar", "wchar"),
+        *("wctype",),
+        # that those of C libraries include
+        *("alloca", "endian", "features", "ieeefp", "memory", "newlib", "pthread"),
+        *("sched", "strings", "unistd", "xlocale"),
         *("all", "arduino", "check", "clean", "help", "install", "m", "replay", "test"),
     }
 )
@@ -156,6 +161,17 @@ def _renamed(text: str, name: str) -> str:
     return _PREFIX.sub(name, text).replace("GPMPC_", f"{name.upper()}_")
 
 
+def _check_own_names(texts: Iterable[str], name: str) -> None:
+    """Raises ``SettingError`` where a public name would be that of another thing."""
+    code = _COMMENT.sub(" ", "\n".join(texts))
+    words = set(re.findall(r"\w+", code))
+    renamed = {word: _renamed(word, name) for word in words}
+    taken = sorted(own for word, own in renamed.items() if own != word and own in words)
+    if taken and name != _NAME:
+        rule = f"the code has names of its own that begin with {name}_"
+        raise SettingError("name", f"{rule}, such as {taken[0]}; take another one")
+
+
 def reduce_points(
     controller: GPMPC, estimator: Estimator | None, points: int
 ) -> tuple[GPMPC, Estimator | None]:
@@ -200,6 +216,7 @@ def write_code(
     if estimator is not None:
         check_estimator(controller, estimator)
     texts = _texts(controller, Numbers(precision), on_failure, estimator, notes)
+    _check_own_names(texts, name)
     folder.mkdir(parents=True, exist_ok=True)
     files = Export(*_sources(folder, name))
     for file, text in zip(files, texts, strict=True):

@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+from dataclasses import replace
 from typing import Any
 
 import casadi
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 from gpmpc.estimation import KalmanFilter, LateMeasurements, Measurement
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.export import (
     CompiledLoop,
     Estimator,
@@ -20,7 +21,7 @@ from gpmpc.export import (
     write_replay,
 )
 from gpmpc.gaussian import Gaussian
-from gpmpc.models import CasadiFunction, DisturbedModel
+from gpmpc.models import Affine, CasadiFunction, DisturbedModel, KnownModel
 from gpmpc.mpc import GPMPC, Box, Halfspaces, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
 from tests.mpc.small_models import pendulum_posterior
@@ -51,9 +52,9 @@ def two_perfect_ones(model=GP):
     return Measurement.of_states(model.state_dim, [0, 0, 1], [0.0, 0.0, 1e-9])
 
 
-def camera(_=GP):
+def camera(_=GP, states=2):
     """A position on a circle, of correlated noise."""
-    x = casadi.SX.sym("x", 2)
+    x = casadi.SX.sym("x", states)
     seen = casadi.vertcat(casadi.sin(x[0]), casadi.cos(x[0]) + 0.1 * x[1])
     noise = torch.tensor([[4e-4, 1e-4], [1e-4, 9e-4]], dtype=torch.float64)
     return Measurement(2, noise, CasadiFunction(casadi.Function("h", [x], [seen])))
@@ -184,6 +185,12 @@ def of_other_states():
     return Estimator(kalman, CASES["a disturbance"][2])
 
 
+def of_more_inputs():
+    two = torch.zeros(2, 2, dtype=torch.float64)
+    model = KnownModel(Affine(torch.eye(2).double(), two, two[0]), 2, 2)
+    return Estimator(KalmanFilter.extended(model, one_angle()), CASES["an angle"][2])
+
+
 def of_another_type():
     belief = CASES["an angle"][2]
     single = Gaussian(belief.mean.float(), belief.covariance.float())
@@ -195,6 +202,7 @@ REFUSED = {
     "filter": late,
     "filter.propagator": unscented,
     "filter.model": of_other_states,
+    "filter.model: inputs": of_more_inputs,
     "measurement.function": of_torch,
     "belief": of_another_type,
 }
@@ -204,5 +212,19 @@ REFUSED = {
 def test_refuses_by_name(key, tmp_path):
     with pytest.raises(SettingError) as caught:
         export_c(pendulum(), tmp_path / "folder", estimator=REFUSED[key]())
-    assert caught.value.key == key
+    assert caught.value.key == key.partition(":")[0]
+    assert not (tmp_path / "folder").exists()
+
+
+@pytest.mark.parametrize(("states", "sensors"), [(2, 1), (3, 2)])
+def test_sensors_that_c_has_no_room_for_are_refused(states, sensors, tmp_path):
+    seen = camera(states=states)
+    noise = seen.noise_covariance[:sensors, :sensors]
+    kalman = KalmanFilter.extended(GP, replace(seen, noise_covariance=noise))
+    with pytest.raises(ShapeError, match=rf"must map \(2,\) to \({sensors},\)"):
+        export_c(
+            pendulum(),
+            tmp_path / "folder",
+            estimator=Estimator(kalman, CASES["an angle"][2]),
+        )
     assert not (tmp_path / "folder").exists()

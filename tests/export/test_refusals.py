@@ -1,15 +1,18 @@
 """What cannot be exported is refused by name, before anything is written."""
 
+import casadi
 import numpy as np
 import pytest
 import torch
 
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.export import Question, export_c, write_replay
+from gpmpc.gaussian import Gaussian
 from gpmpc.models import DelayedModel
 from gpmpc.mpc import (
     GPMPC,
     Inequality,
+    LeastSquares,
     PredictionSettings,
     Problem,
     Reference,
@@ -22,6 +25,7 @@ from tests.mpc.small_models import double_integrator, pendulum_posterior
 
 GP = pendulum_posterior()
 PROBLEM = Problem(Tracking([1.0, 0.1], [0.05]))
+ORIGIN = Reference(np.zeros(2))
 
 
 def gpmpc(
@@ -76,6 +80,47 @@ def test_refuses_by_name(key, tmp_path):
     assert not (tmp_path / "folder").exists()
 
 
+def smooth(states, inputs, values, parameters=0):
+    """A CasADi function of these sizes."""
+    x = casadi.SX.sym("x", states)
+    u = casadi.SX.sym("u", inputs)
+    p = casadi.SX.sym("p", parameters)
+    arguments = [x, u, p] if parameters else [x, u]
+    scale = casadi.sum1(p) if parameters else 1.0
+    value = casadi.vertcat(*[x[0] * scale - u[0] - i for i in range(values)])
+    return casadi.Function("f", arguments, [value])
+
+
+OTHER_SIZES = {
+    "more values": ("h must map", [Inequality(smooth(2, 1, 2))], []),
+    "fewer values": ("h must map", [Inequality(smooth(2, 1, 1), count=2)], []),
+    "more states": ("h must map", [Inequality(smooth(3, 1, 1))], []),
+    "more inputs": ("h must map", [Inequality(smooth(2, 2, 1))], []),
+    "other parameters": (
+        r"u \(1,\), p \(1,\)",
+        [Inequality(smooth(2, 1, 1, 1)), Inequality(smooth(2, 1, 1, 2))],
+        [],
+    ),
+    "more outputs": ("y must map", [], [LeastSquares(smooth(2, 1, 2), [1.0])]),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_SIZES)
+def test_functions_that_c_has_no_room_for_are_refused(name, tmp_path):
+    """As Python refuses them at the first step."""
+    rule, constraints, outputs = OTHER_SIZES[name]
+    weights = Tracking([1.0, 0.1], [0.05])
+    controller = gpmpc(
+        problem=Problem(weights, constraints=constraints, outputs=outputs)
+    )
+    with pytest.raises(ShapeError, match=rule):
+        export_c(controller, tmp_path / "folder")
+    assert not (tmp_path / "folder").exists()
+    parameters = [1.0] if name == "other parameters" else None
+    with pytest.raises(ShapeError):
+        controller.control(Gaussian.certain([0.0, 0.0]), ORIGIN, parameters=parameters)
+
+
 @pytest.mark.parametrize(
     ("key", "value"), [("precision", "half"), ("on_failure", "raise")]
 )
@@ -84,7 +129,9 @@ def test_refuses_other_words(key, value, tmp_path):
         export_c(gpmpc(), tmp_path / "folder", **{key: value})
 
 
-@pytest.mark.parametrize("name", ["", "Outer", "2nd", "a b", "math", "replay"])
+@pytest.mark.parametrize(
+    "name", ["", "Outer", "2nd", "a b", "math", "features", "replay", "write"]
+)
 def test_refuses_names_that_c_or_make_cannot_hold(name, tmp_path):
     with pytest.raises(SettingError) as caught:
         export_c(gpmpc(), tmp_path / "folder", name=name)
