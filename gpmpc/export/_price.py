@@ -6,6 +6,7 @@ the states it decided for, which test the models' predictions, and the reference
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,8 +17,10 @@ from gpmpc.exceptions import Diverged, SettingError, SolverFailure
 from gpmpc.export._replay import Question
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import GPMPC, Decision, Reference
+from gpmpc.mpc._controller import one_step_on
 from gpmpc.signals import Signals
 from gpmpc.simulation import Rollout
+from gpmpc.status import Status
 
 Array = np.ndarray
 # of a state, below which an error is round-off
@@ -29,7 +32,7 @@ Fly = Callable[[Any], Rollout]
 class Flight(NamedTuple):
     """A flight, and what its controller was asked at each of its K steps."""
 
-    questions: list[Question]
+    questions: list[Question]  #: of a lost measurement, the state is NaN
     inputs: Array  #: that were applied (K, m)
     cost: float  #: of all steps
 
@@ -40,7 +43,7 @@ class Flight(NamedTuple):
 
 
 class _Witness:
-    """A controller that notes what it is asked."""
+    """A controller that notes what it is asked, where the state was known."""
 
     def __init__(self, controller: GPMPC):
         self.horizon = controller.horizon
@@ -63,8 +66,10 @@ class _Witness:
     ) -> Decision:
         """Decides as the controller does."""
         measured = to_array(belief.mean).copy()
-        self.questions.append(Question(measured, reference, parameters))
-        return self._controller.control(belief, reference, previous, parameters)
+        decision = self._controller.control(belief, reference, previous, parameters)
+        if decision.status is not Status.INVALID_MEASUREMENT:
+            self.questions.append(Question(measured, reference, parameters))
+        return decision
 
 
 def flight_of(fly: Fly, controller: GPMPC) -> Flight:
@@ -78,16 +83,48 @@ def flight_of(fly: Fly, controller: GPMPC) -> Flight:
     if not isinstance(rollout, Rollout):
         rule = "must return the Rollout of a closed loop"
         raise SettingError("fly", f"{rule}; got {type(rollout).__name__}")
-    steps = len(rollout.inputs)
-    if not 0 < steps <= len(witness.questions):
-        rule = "must fly the controller that it is handed"
-        count = len(witness.questions)
-        raise SettingError(
-            "fly", f"{rule}; it was asked {count} times in {steps} steps"
-        )
-    # a rehearsal asks before the first step
-    questions = witness.questions[-steps:]
+    questions = _questions_by_step(rollout, witness)
     return Flight(questions, rollout.inputs, _cost(rollout, controller, questions))
+
+
+def _questions_by_step(rollout: Rollout, witness: _Witness) -> list[Question]:
+    """Returns what a controller was asked at each step (K,).
+
+    Nobody asks it where a measurement was lost. The reference of such a step is that of
+    the one before, a stage later, or at the beginning that of the first question.
+
+    Raises:
+        SettingError: It was asked at fewer steps than were decided.
+    """
+    is_known = [s is not Status.INVALID_MEASUREMENT for s in rollout.statuses]
+    known = sum(is_known)
+    asked = witness.questions
+    if not 0 < known <= len(asked):
+        rule = "must fly the controller that it is handed"
+        got = f"it was asked {len(asked)} times in {known} steps"
+        raise SettingError("fly", f"{rule}; {got} whose measurement was not lost")
+    # a rehearsal (``gpmpc.simulation.rehearse``) asks before the first step
+    in_flight = iter(asked[len(asked) - known :])
+    first = asked[len(asked) - known]
+    question = first._replace(measured=np.full_like(first.measured, np.nan))
+    questions = []
+    for step, is_asked in enumerate(is_known):
+        if is_asked:
+            question = next(in_flight)
+        elif step > 0:
+            question = _lost_after(question, witness.horizon)
+        questions.append(question)
+    return questions
+
+
+def _lost_after(question: Question, horizon: int) -> Question:
+    """Returns the question of a step without a measurement, after another one."""
+    followed = question.reference.over(horizon)
+    later = replace(followed, states=one_step_on(followed.states))
+    if followed.inputs is not None:
+        later = replace(later, inputs=one_step_on(np.asarray(followed.inputs)))
+    lost = np.full_like(question.measured, np.nan)
+    return question._replace(measured=lost, reference=later)
 
 
 def cost_of(fly: Fly, controller: GPMPC) -> float:

@@ -20,12 +20,14 @@ from gpmpc.export import (
     measure_footprint,
     with_points,
 )
+from gpmpc.export._price import flight_of, ratio_of_errors
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import SparseTrainer, Transitions
 from gpmpc.models import DelayedModel, KnownModel, ResidualModel
 from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
 from gpmpc.propagation import Linearization
-from gpmpc.simulation import ModelLoop, closed_loop
+from gpmpc.simulation import Dropout, ModelLoop, closed_loop, rehearse
+from gpmpc.systems import System
 from tests.export.test_decisions import pendulum_with_features
 from tests.mpc.small_models import pendulum_posterior
 
@@ -259,6 +261,47 @@ def test_a_flight_that_fails_is_lost(compiled):
     choice = choose_points(pendulum(), fails_with_fewer_points, budget, chip="host")
     assert [row.cost for row in choice.rows[1:]] == [np.inf] * (len(choice.rows) - 1)
     assert "lost" in choice.table()
+
+
+class Swing:
+    """The equations of a damped pendulum."""
+
+    state_names = ("angle", "rate")
+    input_names = ("torque",)
+
+    def derivative(self, x, u):
+        return [x[1], -4.0 * np.sin(x[0]) - 0.3 * x[1] + u[0]]
+
+
+@pytest.mark.parametrize(("start", "stop"), [(0.3, 0.7), (-0.1, 0.1)])
+def test_a_lost_measurement_is_no_question(start, stop):
+    """Those after it are of their own steps, and a rehearsal's of none."""
+    plant = System(Swing(), time_step=0.2)
+    path = np.zeros((15, 2))
+    path[:, 0] = 0.1 * np.arange(15)
+    reference = Reference(path, np.zeros((14, 1)))
+
+    def fly_blindly(controller):
+        rehearse(plant, controller, reference, [1.0, 0.0])
+        return closed_loop(
+            plant,
+            controller,
+            reference,
+            [1.0, 0.0],
+            10,
+            disturbances=[Dropout(start, stop)],
+            on_failure="previous_plan",
+        )
+
+    controller = pendulum()
+    rollout = fly_blindly(controller)
+    flight = flight_of(fly_blindly, controller)
+    assert np.isnan(rollout.measured).any()
+    np.testing.assert_array_equal(flight.states, rollout.measured)
+    followed = [question.reference.over(4).states[0] for question in flight.questions]
+    np.testing.assert_array_equal(followed[1:], rollout.references[1:10])
+    assert np.isfinite(flight.cost)
+    assert ratio_of_errors(GP, GP, flight) == 1.0
 
 
 def test_states_that_no_sensor_shows_cost_nothing(compiled):
