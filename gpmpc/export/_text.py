@@ -96,8 +96,9 @@ def unused(arguments: str, lines: Sequence[str]) -> list[str]:
 def comment(text: str) -> str:
     """Returns text as one line of a comment in C, which it does not end early."""
     shown = "".join(letter if letter.isprintable() else " " for letter in text)
-    shown = shown.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/")
-    return shown.replace("??", "? ?")  # a trigraph
+    shown = shown.replace("\\", "/")  # at the end of a line it would go on
+    shown = shown.replace("*/", "* /").replace("/*", "/ *")
+    return re.sub(r"\?(?=\?)", "? ", shown)  # two begin a trigraph
 
 
 def needed_parts(text: str, flags: Mapping[str, int]) -> str:

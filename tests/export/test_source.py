@@ -135,12 +135,13 @@ def test_the_sketch_of_a_board_is_cpp_and_the_source_may_be(tmp_path):
 
 
 def test_names_of_signals_end_no_comment(tmp_path):
-    names = ["*/ int x;", "\u202e\n #error ??/"]
+    names = ["*/ int x;", "*\\ /\\* int y; \u202e\n #error ???/"]
     gp = replace(pendulum_posterior(), signals=Signals(names, ["float"], 0.2))
     problem = Problem(Tracking([1.0, 0.1], [0.05]))
     controller = GPMPC(gp, Linearization(), problem, 6, [0.0], iterations=1)
     export = export_c(controller, tmp_path)
     assert "* / int x;" in export.header.read_text()
+    assert "* / // * int y;" in export.header.read_text()
     assert not complaints(export.source, "-Wall", "-Wextra", "-Werror", "-pedantic")
 
 
