@@ -383,7 +383,8 @@ def view(numbers: Any) -> Array:
 def _continue(fields: Any, previous: Decision) -> None:
     """Writes the last decision to what the code keeps.
 
-    Of a decision of another controller, of other sizes, only the input counts.
+    Of a decision of another controller, of other sizes, only the input counts, and the
+    estimate of a disturbance of as many states.
     """
     _check_shape("input of the last decision", previous.input, (len(fields.input),))
     sizes = (view(fields.means).shape, view(fields.inputs).shape)
@@ -394,8 +395,10 @@ def _continue(fields: Any, previous: Decision) -> None:
     elif fits and previous.solution is not None:
         _write_solution(fields.solution, previous.solution)
     view(fields.input)[:] = previous.input
-    if fits and previous.disturbance is not None:
-        view(fields.disturbance)[:] = previous.disturbance
+    estimate = previous.disturbance
+    if estimate is None or np.shape(estimate) != np.shape(fields.disturbance):
+        estimate = 0.0
+    view(fields.disturbance)[:] = estimate
     fields.has_input = int(np.isfinite(previous.input).all())
     fields.has_plan = int(fits and previous.applicable)
     fields.policy_steps = previous.policy_steps
@@ -440,7 +443,7 @@ def _decision(fields: Any, input: Array, timing: Timing) -> Decision:
         status=status,
         iterations=1,
         timing=timing,
-        disturbance=view(fields.disturbance).astype(float),
+        disturbance=view(fields.estimate).astype(float),
         suboptimal=not (failed or status.solved),
         violation=float(fields.violation),
         memory=bytes(fields),

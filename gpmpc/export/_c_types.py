@@ -51,6 +51,7 @@ def fields_type(
             ("status", ctypes.c_int),
             ("failed", ctypes.c_int),
             ("violation", number),
+            ("estimate", number * n),
             *(belief if filters else ()),
         )
 

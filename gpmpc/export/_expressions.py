@@ -48,8 +48,9 @@ _BINARY: dict[int, str] = {
     tapes.DIV: "{a} / {b}",
     tapes.POW: "POW({a}, {b})",
     tapes.CONSTPOW: "POW({a}, {b})",
-    tapes.FMIN: "smaller({a}, {b})",
-    tapes.FMAX: "larger({a}, {b})",
+    # what is no number limits nothing
+    tapes.FMIN: "{a} <= {b} || isnan({b}) ? {a} : {b}",
+    tapes.FMAX: "{a} >= {b} || isnan({b}) ? {a} : {b}",
     tapes.ATAN2: "ATAN2({a}, {b})",
     tapes.HYPOT: "HYPOT({a}, {b})",
     tapes.FMOD: "FMOD({a}, {b})",
@@ -248,10 +249,8 @@ class Graph:
         if operation == tapes.COPYSIGN:  # 1 where the sign stayed, else -1
             stayed = self.binary(tapes.EQ, node, a)
             return self.binary(tapes.SUB, self.unary(tapes.TWICE, stayed), one)
-        if operation == tapes.FMIN:
-            return self.binary(tapes.LE, a, b)
-        if operation == tapes.FMAX:
-            return self.binary(tapes.LE, b, a)
+        if operation in (tapes.FMIN, tapes.FMAX):
+            return self.binary(tapes.EQ, node, a)
         if operation in (tapes.POW, tapes.CONSTPOW):
             lower = self.binary(tapes.SUB, b, one)
             power = self.binary(operation, a, lower)

@@ -215,6 +215,14 @@ static const real *input_weight(int k)
     return input_weights + (GPMPC_INPUT_WEIGHTS > 1 ? k : 0) * m * m;
 }
 
+/* The input that was applied last; the initial one where none was, or no number. */
+static const real *last_input(const gpmpc_controller *controller)
+{
+    if (controller->has_input && all_finite(controller->input, m))
+        return controller->input;
+    return initial_input;
+}
+
 /* Index of the stage model of stage k: of H, or the one that is held. */
 static int stage_of(int k) { return GPMPC_STAGES > 1 ? k : 0; }
 
@@ -327,18 +335,14 @@ static int is_used_up(const gpmpc_controller *controller)
 }
 
 /* d <- (1 - L) d + L (x - f(x', u')): what the last step showed of a constant error;
-   after steps of the policy it is the mean of all */
+   after steps of the policy it is the mean of all. Without a plan it stays. */
 static void estimate_disturbance(gpmpc_controller *controller, const real *state)
 {
     real mean[GPMPC_STATES];
     real error[GPMPC_STATES];
     real gain = GPMPC_DISTURBANCE_GAIN / (1 + (real)controller->policy_steps);
     int i, a;
-    if (!controller->has_plan) {
-        fill(controller->disturbance, 0, n);
-        return;
-    }
-    if (is_used_up(controller))
+    if (!controller->has_plan || is_used_up(controller))
         return;
     model(controller->means[0], controller->problem.previous_input,
           &controller->problem.work, mean, 0, 0);
@@ -351,7 +355,7 @@ static void estimate_disturbance(gpmpc_controller *controller, const real *state
     if (!all_finite(error, n)) /* the model has no numbers there */
         return;
     for (i = 0; i < n; i++)
-        controller->disturbance[i] += gain * (error[i] - controller->disturbance[i]);
+        controller->estimate[i] += gain * (error[i] - controller->estimate[i]);
 }
 
 #if GPMPC_TUBES
@@ -423,7 +427,7 @@ static int linearize(gpmpc_controller *controller)
 #endif
         model(s, u, work, next, &problem->A[k][0][0], &problem->B[k][0][0]);
         for (i = 0; i < n; i++) {
-            real after = next[i] + (GPMPC_ESTIMATES ? controller->disturbance[i] : 0);
+            real after = next[i] + (GPMPC_ESTIMATES ? controller->estimate[i] : 0);
             write_offset(problem, k, i, after, s, u);
             if (!GPMPC_HELD)
                 moves = moves && is_motion(after, problem->states[k + 1][i], i);
@@ -450,7 +454,7 @@ static void follow_inputs(gpmpc_controller *controller)
         model(problem->states[k], problem->inputs[k], &problem->work,
               problem->states[k + 1], 0, 0);
         for (i = 0; i < n && GPMPC_ESTIMATES; i++)
-            problem->states[k + 1][i] += controller->disturbance[i];
+            problem->states[k + 1][i] += controller->estimate[i];
     }
     if (!all_finite(&problem->states[0][0], (H + 1) * n))
         for (k = 1; k <= H; k++)
@@ -1226,7 +1230,7 @@ static void follow(gpmpc_controller *controller, real *states, real *inputs)
         copy(next, target, n);
         model(state, inputs + k * m, &problem->work, next, 0, 0);
         for (i = 0; i < n && GPMPC_ESTIMATES; i++)
-            next[i] += controller->disturbance[i];
+            next[i] += controller->estimate[i];
     }
 }
 #endif
@@ -1650,9 +1654,9 @@ static int is_usable(const gpmpc_controller *controller)
 }
 
 #if GPMPC_ROLLS_OUT
-/* Rolls the dynamics out towards the plan, so that it obeys them; the plan stays where
-   that leads out of the numbers. */
-static void close_defects(gpmpc_controller *controller)
+/* Rolls the dynamics out towards the plan, so that it obeys them. Returns whether that
+   ends in numbers: else the plan stays. */
+static int close_defects(gpmpc_controller *controller)
 {
     gpmpc_problem *problem = &controller->problem;
     real states[(GPMPC_HORIZON + 1) * GPMPC_STATES];
@@ -1663,15 +1667,17 @@ static void close_defects(gpmpc_controller *controller)
     copy(&problem->inputs[0][0], inputs, H * m);
     follow(controller, states, inputs);
     if (!all_finite(states, (H + 1) * n))
-        return;
+        return 0;
     copy(states, &problem->states[0][0], (H + 1) * n);
     copy(inputs, &problem->inputs[0][0], H * m);
+    return 1;
 }
 #endif
 
 #if GPMPC_ROLLS_OUT
-/* Takes the plan of the solution, rolled out where all functions are finite there; else
-   as the program sees it, with the rows of the guess. */
+/* Takes the plan of the solution, rolled out where that ends in numbers and all
+   functions are finite there; else as the program sees it, with the rows of the
+   guess. */
 static void take_rolled_out(gpmpc_controller *controller,
                             const gpmpc_reference *reference)
 {
@@ -1688,7 +1694,8 @@ static void take_rolled_out(gpmpc_controller *controller,
     (void)reference;
 #endif
     expand(problem, controller->candidate.x, inputs, states);
-    close_defects(controller);
+    if (!close_defects(controller))
+        return;
 #if GPMPC_SMOOTH || GPMPC_OUTPUTS
 #if GPMPC_OUTPUTS
     is_finite_there = write_outputs(problem, reference);
@@ -1731,14 +1738,22 @@ static int write_problem(gpmpc_controller *controller, const real *state,
                          const real *covariance, const gpmpc_reference *reference)
 {
     gpmpc_problem *problem = &controller->problem;
-    copy(controller->has_input ? controller->input : initial_input,
-         problem->previous_input, m);
+    copy(last_input(controller), problem->previous_input, m);
     read_reference(controller, state, reference);
     if (GPMPC_ESTIMATES)
         estimate_disturbance(controller, state);
     guess_states(controller, state);
     guess_inputs(controller);
     if (!linearize(controller)) {
+        /* a guess that is dropped fails the step, too, where a function has no number */
+#if GPMPC_OUTPUTS
+        if (!write_outputs(problem, reference))
+            return 0;
+#endif
+#if GPMPC_SMOOTH
+        if (!write_smooth_rows(problem, reference))
+            return 0;
+#endif
         follow_inputs(controller);
         (void)linearize(controller);
     }
@@ -1829,7 +1844,7 @@ static int decide(gpmpc_controller *controller, const real *state,
 /* Puts an input into the box and, among these, within the rates. */
 static void keep_bounds(const gpmpc_controller *controller, real *input)
 {
-    const real *last = controller->has_input ? controller->input : initial_input;
+    const real *last = last_input(controller);
     int i;
     for (i = 0; i < m; i++)
         input[i] = within_box(within_rates(input[i], last[i], 0, i), 0, i);
@@ -1889,6 +1904,7 @@ static void apply_known_input(gpmpc_controller *controller,
     controller->has_input = 1;
     controller->has_plan = 0;
     controller->solution.rows = -1;
+    fill(controller->disturbance, 0, n);
 }
 
 /* Takes the plan of the step for the one to go on from. Returns whether it may. */
@@ -1899,6 +1915,7 @@ static int take_plan(gpmpc_controller *controller)
         return 0;
     copy(&problem->states[0][0], &controller->means[0][0], (H + 1) * n);
     copy(&problem->inputs[0][0], &controller->inputs[0][0], H * m);
+    copy(controller->estimate, controller->disturbance, n);
     controller->solution = controller->candidate;
     controller->has_plan = 1;
     controller->policy_steps = 0;
@@ -1921,6 +1938,7 @@ void gpmpc_reset(gpmpc_controller *controller)
     controller->solution.working = 0;
     controller->solution.status = GPMPC_SOLVED;
     fill(controller->disturbance, 0, n);
+    fill(controller->estimate, 0, n);
 #if GPMPC_FILTERS
     copy(first_mean, controller->belief.mean, n);
     copy(first_covariance, controller->belief.covariance, n * n);
@@ -1933,13 +1951,16 @@ void gpmpc_hold(gpmpc_reference *reference, const gpmpc_real state[GPMPC_STATES]
     for (k = 0; k <= H; k++)
         copy(state, reference->states[k], n);
     fill(&reference->inputs[0][0], 0, H * m);
-    fill(&reference->parameters[0][0], 0, H * GPMPC_AT_LEAST_ONE(GPMPC_PARAMETERS));
+    fill(&reference->parameters[0][0], NAN, H * GPMPC_AT_LEAST_ONE(GPMPC_PARAMETERS));
     reference->has_inputs = 0;
 }
 
-/* Whether parameters, which are measured as the state is, are finite. */
-static int knows_parameters(const gpmpc_reference *reference)
+/* Whether a reference holds all that is asked for: inputs that deviations are counted
+   from, and parameters, which are measured as the state is. */
+static int is_complete(const gpmpc_reference *reference)
 {
+    if (GPMPC_PENALIZED == DEVIATIONS && !reference->has_inputs)
+        return 0;
     return all_finite(&reference->parameters[0][0], H * GPMPC_PARAMETERS);
 }
 
@@ -1950,10 +1971,9 @@ int gpmpc_step_belief(gpmpc_controller *controller, const gpmpc_real mean[GPMPC_
 {
     int applicable = 0;
     int status = GPMPC_INVALID_MEASUREMENT;
-    real disturbance[GPMPC_STATES];
-    copy(controller->disturbance, disturbance, n);
+    copy(controller->disturbance, controller->estimate, n);
     if (all_measured(mean, n) && all_finite(covariance, n * n)
-        && knows_parameters(reference))
+        && is_complete(reference))
         status = decide(controller, mean, covariance, reference, &applicable);
     if (applicable && !take_plan(controller)) {
         applicable = 0;
@@ -1961,7 +1981,6 @@ int gpmpc_step_belief(gpmpc_controller *controller, const gpmpc_real mean[GPMPC_
     }
     if (!applicable) {
         controller->violation = NAN;
-        copy(disturbance, controller->disturbance, n);
         if (!continue_last_plan(controller))
             apply_known_input(controller, reference);
     }

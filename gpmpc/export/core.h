@@ -22,7 +22,8 @@ enum gpmpc_status {
     GPMPC_ITERATION_LIMIT,      /* the quadratic program took too many changes */
     GPMPC_TIME_LIMIT,           /* never: a step knows no clock */
     GPMPC_NUMERICAL_TROUBLE,    /* the digits did not suffice, or were not finite */
-    /* what was measured, or a parameter, is not finite; or a measurement is >= 1e30 */
+    /* what was measured, or a parameter, is not finite; or a measurement is >= 1e30;
+       or there are no reference inputs where deviations from them are weighed */
     GPMPC_INVALID_MEASUREMENT,
     GPMPC_FUNCTION_NOT_FINITE,  /* a constraint or an output is not */
     GPMPC_SOFT_BOUND_MISSED,    /* solved, but a soft bound is missed */
@@ -48,7 +49,7 @@ enum gpmpc_status {
 typedef struct {
     gpmpc_real states[GPMPC_HORIZON + 1][GPMPC_STATES]; /* r_0 .. r_H; r_0 is now */
     gpmpc_real inputs[GPMPC_HORIZON][GPMPC_INPUTS];     /* u*_0 .. u*_{H-1} */
-    int has_inputs; /* whether the inputs are known; else they count as zero */
+    int has_inputs; /* whether the inputs are known: deviations are from them */
     /* of outputs and inequalities, by stage */
     gpmpc_real parameters[GPMPC_HORIZON][GPMPC_AT_LEAST_ONE(GPMPC_PARAMETERS)];
 } gpmpc_reference;
@@ -198,12 +199,13 @@ typedef struct {
     gpmpc_real input[GPMPC_INPUTS]; /* the one that was applied */
     gpmpc_real means[GPMPC_HORIZON + 1][GPMPC_STATES];
     gpmpc_real inputs[GPMPC_HORIZON][GPMPC_INPUTS];
-    gpmpc_real disturbance[GPMPC_STATES];
+    gpmpc_real disturbance[GPMPC_STATES]; /* as that plan was made with */
     gpmpc_solution solution;
     /* how the last step ended */
     int status;
     int failed; /* whether the policy chose its input */
     gpmpc_real violation; /* by how much its plan misses a bound; NAN where it failed */
+    gpmpc_real estimate[GPMPC_STATES]; /* of a disturbance, that it decided with */
 #if GPMPC_FILTERS
     gpmpc_belief belief; /* that the last step decided for */
 #endif
@@ -219,19 +221,23 @@ typedef struct {
 /* Forgets everything: the next step is a first one. */
 void gpmpc_reset(gpmpc_controller *controller);
 
-/* Makes a set point the reference of the whole horizon. */
+/* Makes a set point the reference of the whole horizon. Its inputs, where deviations
+   are weighed, and parameters are to be written behind it: until then they are unknown,
+   and a step that needs them fails. */
 void gpmpc_hold(gpmpc_reference *reference, const gpmpc_real state[GPMPC_STATES]);
 
 /* Decides the input of a time step. Without a filter what is measured is the state (n),
    which counts as certain. With one (GPMPC_FILTERS) it is what sensors show: entries
    that are not finite, or 1e30 or more in size, are missing, and the last step's input
-   counts as applied; where another one was, write it to controller.input before. */
+   counts as applied; where another one was, write it to controller.input before.
+   A belief that is once no number, where the model has none, stays so, and all steps
+   fail: gpmpc_reset begins again. */
 int gpmpc_step(gpmpc_controller *controller,
                const gpmpc_real measured[GPMPC_MEASURED],
                const gpmpc_reference *reference, gpmpc_real input[GPMPC_INPUTS]);
 
-/* The same for a state of which a mean and a covariance are known: no filter is
-   asked. */
+/* The same for a state of which a mean and a covariance are known: no filter is asked,
+   and none is told; where there is one, controller.belief stays a step behind. */
 int gpmpc_step_belief(gpmpc_controller *controller, const gpmpc_real mean[GPMPC_STATES],
                       const gpmpc_real covariance[GPMPC_STATES * GPMPC_STATES],
                       const gpmpc_reference *reference,

@@ -35,7 +35,7 @@ static void predict_belief(gpmpc_controller *controller)
     gpmpc_belief *belief = &controller->belief;
     gpmpc_work *work = &controller->problem.work;
     work->lane = 0;
-    filter_model(belief->mean, controller->input, work, mean, A, B);
+    filter_model(belief->mean, last_input(controller), work, mean, A, B);
     filter_model_variances(work, variance);
     filter_model_covariance(variance, V);
     work->lane = -1;

@@ -526,6 +526,10 @@ def test_every_operation_of_casadi_is_written():
         casadi.if_else(casadi.logic_and(a != b, a > c), u, a),
         casadi.if_else(a > 10.0, casadi.log(a - 10.0), u),  # NaN, not chosen
     ]
+    terms += [  # what is no number limits nothing
+        *(casadi.fmax(0.2, casadi.log1p(a - 1.5)), casadi.fmin(casadi.atanh(b), c)),
+        casadi.fmin(0.2, casadi.atanh(c - 1.0)),
+    ]
     weighed = sum((0.01 + 0.001 * i) * term for i, term in enumerate(terms))
     after = casadi.vertcat(0.8 * a + 0.1 * weighed + u, 0.5 * x[1] + weighed)
     model = KnownModel(CasadiFunction(casadi.Function("f", [x, u], [after])), 2, 1)
@@ -577,9 +581,84 @@ def test_an_estimate_stays_where_the_model_has_no_numbers():
     assert expected.disturbance[0] == 0.05
     assert got.status is expected.status is Status.SOLVED
     assert np.abs(got.inputs - expected.inputs).max() < 1e-9
+    # Lost, the state says nothing: the estimate stays, also where a failed decision
+    # is handed on.
+    lost = Gaussian.certain([np.nan, 0.0])
+    failed = [asked.control(lost, goal, last) for asked in (controller, compiled)]
+    for asked, previous in zip((controller, compiled), failed, strict=True):
+        assert previous.disturbance[0] == 0.05
+        got = asked.control(belief, goal, previous)
+        assert got.disturbance[0] == 0.05
+        assert np.abs(got.inputs - expected.inputs).max() > 0.01
     # A first guess, on a line to below empty, is left for what its inputs lead to.
     empty = Reference(np.array([-5.0, 0.0]))
     expected = controller.control(belief, empty)
     got = compiled.control(belief, empty)
     assert got.status is expected.status is Status.SOLVED
+    assert np.abs(got.inputs - expected.inputs).max() < 1e-9
+
+
+def test_a_failed_step_hands_its_estimate_on():
+    """Also one whose state was measured, and whose program has no solution."""
+    keeps_away = Box([2.0, -np.inf], penalty=None)
+    problem = Problem(WEIGHTS, TORQUES, constraints=[keeps_away])
+    controller = gpmpc(problem, disturbance_gain=0.3)
+    compiled = CompiledController(controller, compiler=COMPILER)
+    origin = Reference(np.zeros(2))
+    free = gpmpc(Problem(WEIGHTS, TORQUES), disturbance_gain=0.3)
+    last = free.control(Gaussian.certain([0.3, -0.2]), origin)
+    estimates = []
+    for asked in (controller, compiled):
+        failed = asked.control(Gaussian.certain([0.4, 0.1]), origin, last)
+        assert failed.status is Status.INFEASIBLE
+        again = asked.control(Gaussian.certain([0.4, 0.1]), origin, failed)
+        estimates.append([failed.disturbance, again.disturbance])
+    assert np.abs(estimates[0]).min() > 1e-3
+    assert np.abs(np.diff(estimates, axis=0)).max() < 1e-9
+
+
+def leaking_tank(level):
+    """A model without a number below empty, and a bound by the logarithm of a level."""
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u")
+    after = casadi.vertcat(x[0] + 0.2 * (u - casadi.sqrt(x[0])), 0.9 * x[1])
+    model = KnownModel(CasadiFunction(casadi.Function("f", [x, u], [after])), 2, 1)
+    full = Inequality(casadi.Function("h", [x], [casadi.log(level(x)) - 2.0]))
+    problem = Problem(WEIGHTS, TORQUES, constraints=[full])
+    return gpmpc(problem, model, covariance="none")
+
+
+def exploding():
+    """Plans far from the origin, where roll-outs overflow, under a curved bound."""
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u")
+    after = 0.5 * x[0] + u + x[0] * (casadi.exp(x[0] ** 2) - 1.0)
+    f = casadi.Function("f", [x, u], [casadi.vertcat(after, 0.5 * x[1])])
+    near = casadi.Function("h", [x], [x[0] ** 2 - 100.0])
+    problem = Problem(
+        Tracking([1.0, 0.1], [0.05], penalized="inputs"), constraints=[Inequality(near)]
+    )
+    model = KnownModel(CasadiFunction(f), 2, 1)
+    return gpmpc(problem, model, covariance="none", rolled_out=True)
+
+
+BEYOND_NUMBERS = {
+    "a bound at the guess": (leaking_tank(lambda x: x[0]), Status.FUNCTION_NOT_FINITE),
+    "no bound at the guess": (leaking_tank(lambda x: x[1] + 1.0), Status.SOLVED),
+    "a roll-out": (exploding(), Status.SOLVED),
+}
+
+
+@pytest.mark.parametrize("name", BEYOND_NUMBERS)
+def test_what_has_no_number_ends_as_in_python(name):
+    controller, status = BEYOND_NUMBERS[name]
+    compiled = CompiledController(controller, compiler=COMPILER)
+    belief = Gaussian.certain([1.0, 0.0])
+    goal = Reference(np.array([-5.0, 0.0]))
+    if name == "a roll-out":
+        belief = Gaussian.certain([0.0, 0.0])
+        goal = Reference(np.array([40.0, 0.0]))
+    expected = controller.control(belief, goal)
+    got = compiled.control(belief, goal)
+    assert got.status is expected.status is status
     assert np.abs(got.inputs - expected.inputs).max() < 1e-9

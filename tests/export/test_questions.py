@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 
+import casadi
 import numpy as np
 import pytest
 import torch
@@ -20,8 +21,16 @@ from gpmpc.export import (
 from gpmpc.export._text import Numbers
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.models import Affine, ResidualModel
-from gpmpc.mpc import GPMPC, Box, Halfspaces, Problem, Reference, Tracking
+from gpmpc.models import Affine, KnownModel, ResidualModel
+from gpmpc.mpc import (
+    GPMPC,
+    Box,
+    Halfspaces,
+    Inequality,
+    Problem,
+    Reference,
+    Tracking,
+)
 from gpmpc.propagation import Linearization
 from tests.mpc.small_models import pendulum_posterior
 
@@ -150,3 +159,141 @@ def test_a_replay_without_reference_inputs_begins_as_python(tmp_path):
     for text, code in ((f"{comment}\n{other[len(comment) :]}", 1), (comment, 2)):
         (tmp_path / "replay.txt").write_text(text)
         assert replayed().returncode == code
+
+
+def integrator(penalized, parameters):
+    """A controller of deviations, or of increments, with a bound of parameters."""
+    x = casadi.SX.sym("x", 1)
+    u = casadi.SX.sym("u")
+    p = casadi.SX.sym("p", parameters)
+    arguments = [x, u, p] if parameters else [x, u]
+    ceiling = casadi.sum1(p) if parameters else 2.0
+    below = Inequality(casadi.Function("h", arguments, [x[0] - ceiling]))
+    one = torch.ones(1, 1)
+    return GPMPC(
+        KnownModel(Affine(one, one, torch.zeros(1)), 1, 1),
+        Linearization(),
+        Problem(
+            Tracking([1.0], [0.1], penalized=penalized),
+            Box([-2.0], [2.0]),
+            constraints=[below],
+        ),
+        4,
+        [0.0],
+        iterations=1,
+    )
+
+
+PARTIAL = {"reference inputs": ("deviations", 0), "parameters": ("increments", 2)}
+FIRMWARE = """
+    #include "gpmpc.h"
+
+    static gpmpc_controller controller;
+    static gpmpc_reference reference;
+
+    int main(void)
+    {
+        const gpmpc_real state[GPMPC_STATES] = {0.5};
+        gpmpc_real input[GPMPC_INPUTS];
+        int k, i;
+        gpmpc_reset(&controller);
+        gpmpc_hold(&reference, state);
+        if (gpmpc_step(&controller, state, &reference, input)
+            != GPMPC_INVALID_MEASUREMENT)
+            return 1;
+        reference.has_inputs = 1;
+        for (k = 0; k < GPMPC_HORIZON; k++)
+            for (i = 0; i < GPMPC_PARAMETERS; i++)
+                reference.parameters[k][i] = 1;
+        if (gpmpc_step(&controller, state, &reference, input) != GPMPC_SOLVED)
+            return 2;
+        controller.input[0] = -controller.violation / 0.0; /* it is not known */
+        if (gpmpc_step(&controller, state, &reference, input) != GPMPC_SOLVED)
+            return 3;
+        return 0;
+    }
+"""
+
+
+@pytest.mark.parametrize("part", PARTIAL)
+def test_what_a_reference_lacks_fails_a_step(part, tmp_path):
+    """Where Python raises an error; an input that is not known is the initial one."""
+    export_c(integrator(*PARTIAL[part]), tmp_path)
+    (tmp_path / "main.c").write_text(FIRMWARE)
+    sources = ["main.c", "src/gpmpc.c"]
+    command = ["cc", "-std=c99", "-O0", "-Isrc", *sources, "-lm", "-o", "firmware"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    assert subprocess.run(["./firmware"], cwd=tmp_path).returncode == 0
+
+
+ROS = """
+    #pragma once
+    #include <cstdio>
+    #include <functional>
+    #include <map>
+    #include <memory>
+    #include <string>
+    #include <vector>
+    #define RCLCPP_WARN(logger, ...) (void)(logger), std::printf(__VA_ARGS__)
+    namespace std_msgs { namespace msg {
+    struct Float64MultiArray { std::vector<double> data; };
+    } }
+    using Message = std_msgs::msg::Float64MultiArray;
+    static std::map<std::string, std::function<void(const Message &)>> topics;
+    namespace rclcpp {
+    template <class M> struct Publisher {
+        using SharedPtr = std::shared_ptr<Publisher>;
+        void publish(const M &m) { std::printf("%zu published\\n", m.data.size()); }
+    };
+    template <class M> struct Subscription {
+        using SharedPtr = std::shared_ptr<Subscription>;
+    };
+    struct Node {
+        explicit Node(const char *) {}
+        int get_logger() { return 0; }
+        template <class M>
+        typename Publisher<M>::SharedPtr create_publisher(const char *, int)
+        {
+            return std::make_shared<Publisher<M>>();
+        }
+        template <class M, class F>
+        typename Subscription<M>::SharedPtr
+        create_subscription(const char *name, int, F read)
+        {
+            topics[name] = read;
+            return std::make_shared<Subscription<M>>();
+        }
+    };
+    inline void init(int, char **) {}
+    inline void shutdown() {}
+    template <class N> void spin(const std::shared_ptr<N> &)
+    {
+        for (std::string told : {"measured", "reference", "reference_input"}) {
+            topics[told](Message{{0.5}});
+            topics["measured"](Message{{0.5}});
+        }
+        std::printf("parameters\\n");
+        topics["parameters"](Message{{1.0, 1.0}});
+        topics["measured"](Message{{0.5}});
+    }
+    }
+"""
+
+
+@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler")
+@pytest.mark.parametrize("part", PARTIAL)
+def test_the_node_waits_for_what_a_step_needs(part, tmp_path):
+    export_c(integrator(*PARTIAL[part]), tmp_path)
+    for header in ("rclcpp/rclcpp.hpp", "std_msgs/msg/float64_multi_array.hpp"):
+        file = tmp_path / "ros" / header
+        file.parent.mkdir(parents=True)
+        file.write_text(ROS)
+    strict = ["-Wall", "-Wextra", "-Werror"]
+    sources = ["-x", "c++", "ros2/node.cpp", "src/gpmpc.c"]
+    command = ["c++", "-std=c++17", "-O0", "-Isrc", "-Iros", *strict, *sources]
+    command += ["-lm", "-o", "node"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    done = subprocess.run(["./node"], cwd=tmp_path, capture_output=True, text=True)
+    before, after = done.stdout.split("parameters\n")
+    assert before.count("1 published") == (part == "reference inputs")
+    assert after.count("1 published") == 1

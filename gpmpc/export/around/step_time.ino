@@ -4,14 +4,13 @@
 #include <gpmpc.h>
 
 static gpmpc_controller controller;
-static gpmpc_reference reference;
+static gpmpc_reference reference; /* all zero, parameters too */
 
 void setup()
 {
-    const gpmpc_real set_point[GPMPC_STATES] = {0};
     Serial.begin(115200);
     gpmpc_reset(&controller);
-    gpmpc_hold(&reference, set_point);
+    reference.has_inputs = 1;
 }
 
 void loop()
