@@ -84,7 +84,10 @@ class _Environment(Simulator):
         return self._state(observation), bool(terminated or truncated)
 
     def _set(self, state: Array) -> bool:
-        """Sets a MuJoCo environment to a state."""
+        """Sets a MuJoCo environment to a state, where it shows all of it.
+
+        Some show velocities up to a limit: what they showed is then another state.
+        """
         inner = self.environment.unwrapped
         model: Any = getattr(inner, "model", None)
         if (
@@ -92,6 +95,9 @@ class _Environment(Simulator):
             or not hasattr(inner, "set_state")
             or len(state) != model.nq + model.nv
         ):
+            return False
+        data: Any = getattr(inner, "data", None)
+        if not np.array_equal(np.concatenate([data.qpos, data.qvel]), self._now):
             return False
         inner.set_state(state[: model.nq], state[model.nq :])
         return True
@@ -178,7 +184,7 @@ def make_environment(system: System | str, **settings: Any) -> Any:
     the state. The reward is minus the squared distance of the tracked states from the
     goal, summed over their units; an episode ends where those of one unit are farther
     from it than at the start, and than ``System.lost``. A simulator starts where it
-    starts by itself.
+    starts by itself, and ends where it ends.
 
     Raises:
         SettingError: There are settings beside a system that was made.
@@ -238,6 +244,8 @@ def make_environment(system: System | str, **settings: Any) -> Any:
             terminated = not all(
                 distance <= self._limits[unit] for unit, distance in distances.items()
             )
+            if flown.stateful:
+                terminated = terminated or flown.dynamics.ended
             return self.state.copy(), reward, terminated, False, {}
 
         def _distances(self) -> dict[str, float]:

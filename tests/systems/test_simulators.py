@@ -362,3 +362,25 @@ def test_misuse_of_simulators_is_one_clear_line(cart, tmp_path, monkeypatch):
         match=r"needs mujoco, which is not installed: pip install 'gpmpc\[sim\]'",
     ):
         mujoco_system(cart, ["push"], joints=["slider", "hinge"])
+
+
+def test_a_hopper_that_falls_ends_and_one_that_spins_shows_another_state():
+    """It ends by itself once it leans, and shows velocities up to 10 alone."""
+    pytest.importorskip("imageio")  # which gymnasium's MuJoCo environments need
+    whole = {"exclude_current_positions_from_observation": False}
+    hopper = gymnasium_system("Hopper-v5", make=whole)
+    inner = hopper.dynamics.environment.unwrapped
+    environment = make_environment(hopper)
+    environment.reset(seed=0)
+    push = np.zeros(3)
+    assert not environment.step(push)[2]
+    leaning = environment.state.copy()
+    leaning[2] = 1.0
+    environment.state = leaning
+    assert environment.step(push)[2]
+    spinning = hopper.dynamics.reset(0)
+    inner.set_state(spinning[:6], np.full(6, 20.0))
+    shown = hopper.dynamics.successor(spinning, push)
+    assert np.abs(shown[6:]).max() == 10.0
+    with pytest.raises(SettingError, match="cannot be set to a state"):
+        hopper.dynamics.successor(shown + 1e-3, push)
