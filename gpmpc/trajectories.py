@@ -164,7 +164,7 @@ class Lorenz:
     def _lorenz_time(self, time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Lorenz time at flight times, and its rate of change."""
         t = np.asarray(time, dtype=float)
-        if np.any(t < 0) or np.any(t > self.duration):
+        if not ((t >= 0) & (t <= self.duration)).all():
             rule = f"this Lorenz trajectory is defined from 0 to {self.duration:g} s"
             raise SettingError("duration", f"{rule}; got {t.min():g} to {t.max():g} s")
         samples = self._samples
@@ -278,11 +278,17 @@ def states_along(trajectory: Trajectory, time: np.ndarray) -> np.ndarray:
     """Returns translational states x, vx, y, vy, z, vz (..., 6) [m, m/s].
 
     They are those of a flight along a trajectory at times (...) [s].
+
+    Raises:
+        SettingError: The trajectory has no velocity, or not three coordinates.
     """
     if not hasattr(trajectory, "velocity"):
         rule = "must have positions over time and the method velocity(time)"
         raise SettingError("trajectory", f"{rule}; got {trajectory!r}")
     positions = trajectory(time)
+    if positions.shape[-1] != 3:
+        rule = "must have positions (..., 3), x, y and z"
+        raise SettingError("trajectory", f"{rule}; got {positions.shape[-1]} entries")
     return np.stack([positions, trajectory.velocity(time)], axis=-1).reshape(
         *positions.shape[:-1], 6
     )

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import SettingError
-from gpmpc.trajectories import Elliptical, Hover, Lorenz, Step, Waypoints
+from gpmpc.trajectories import Elliptical, Hover, Lorenz, Step, Waypoints, states_along
 
 WAYPOINTS = Waypoints([0.0, 3.0, 10.0], [[0, 0, 0], [1, -2, 3], [1, 5, -4]])
 ALL = [Elliptical(), Lorenz(), Step(at=3.3), Hover([1, 2, 3]), WAYPOINTS]
@@ -97,6 +97,10 @@ def test_a_step_jumps_at_its_time():
             lambda: Waypoints([0, 0], [[0, 0, 0], [1, 1, 1]]),
             r"strictly increasing \[s\]; got \[0, 0\]",
         ),
+        (
+            lambda: states_along(Hover([1, 2]), np.zeros(4)),
+            r"trajectory: must have positions \(..., 3\), x, y and z; got 2 entries",
+        ),
     ],
 )
 def test_misuse_is_refused_with_the_rule(build, message):
@@ -140,7 +144,7 @@ def test_a_senseless_setting_of_lorenz_is_refused_by_name(setting, value):
         Lorenz(**{setting: value})
 
 
-@pytest.mark.parametrize("time", [-0.1, 20.1])
+@pytest.mark.parametrize("time", [-0.1, 20.1, np.nan])
 def test_lorenz_is_defined_from_start_to_duration_inclusive(time):
     trajectory = Lorenz(duration=20.0)
     assert np.isfinite(trajectory(np.array([0.0, 20.0]))).all()

@@ -19,6 +19,7 @@ where that input is no function of the state: one that is constant, that moves w
 another one, or that a feedback alone makes says nothing of a delay.
 """
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -36,6 +37,8 @@ from gpmpc.exceptions import (
     check_number,
 )
 
+_log = logging.getLogger(__name__)
+
 # Part of a square that a regression leaves, below which it leaves nothing.
 _DEPENDENT = 1e-8
 _RIDGE = 1e-9  # of columns of unit square: some draws of rows do not tell them apart
@@ -50,7 +53,8 @@ class DelayEstimate:
     """
 
     steps: float  #: the delay with the largest correlation [steps]
-    #: that holds the delay with the confidence asked for [steps]
+    #: that holds the delay with the confidence asked for [steps]; where it reaches the
+    #: longest that was tried, the delay may be longer
     interval: tuple[float, float]
     delays: Array  #: all that were tried (T,) [steps]
     correlations: Array  #: of each (T,), from 0 to 1
@@ -73,7 +77,8 @@ def estimate_delay(
         states: x_0 .. x_T of one log at equal time steps (T + 1, n).
         inputs: u_0 .. u_{T-1} (T, m) or one more; they must move independently of the
             state now and then.
-        longest: No longer delay is tried [steps].
+        longest: No longer delay is tried [steps]. Where the interval reaches it, a line
+            of the log says so.
         resolution: Steps between two delays that are tried, from zero on; 1 for whole
             ones only.
         confidence: Of the interval, between 0 and 1.
@@ -148,6 +153,12 @@ def estimate_delay(
     tails = [(1 - confidence) / 2, (1 + confidence) / 2]
     low, high = np.quantile(drawn_delays, tails, method="inverted_cdf")
     best = delays[np.argmax(scores)]
+    if max(high, best) == delays[-1]:
+        _log.warning(
+            "estimate_delay: the interval reaches the longest delay that was tried, %g "
+            "steps: the delay may be longer. Try a larger `longest`",
+            delays[-1],
+        )
     margin = 0.0 if resolution == 1 else resolution / 2
     return DelayEstimate(
         steps=float(best),

@@ -308,8 +308,11 @@ class KalmanFilter:
         """Makes the unscented Kalman filter."""
         return cls(model, measurement, propagator=Unscented(), observer=Unscented())
 
-    def predict(self, belief: Gaussian, input: Any) -> Gaussian:
-        """Moves a belief (*batch, n) on by a step with an applied input (*batch, m)."""
+    def predict(self, belief: Gaussian, input: Any = None) -> Gaussian:
+        """Moves a belief (*batch, n) on by a step with an applied input (*batch, m).
+
+        The input may be left out where m = 0.
+        """
         check_kind("belief", belief, Gaussian, "a Gaussian")
         belief = belief.in_order(self._names.state_names)
         control = self._as_input(belief, input)
@@ -346,7 +349,9 @@ class KalmanFilter:
         )
 
     def _as_input(self, belief: Gaussian, input: Any) -> Tensor:
-        """Converts an input to a tensor of its own, like a belief's."""
+        """Converts an input to a tensor of its own, like a belief's; None to none."""
+        if input is None:
+            return belief.mean[..., :0]
         return _like(belief, "input", input, self._names.input_names)
 
     def _as_measurement(self, belief: Gaussian, measured: Any) -> Tensor:
@@ -504,8 +509,11 @@ class LateMeasurements:
         self._inputs: deque[Tensor] = deque(maxlen=longest)
         self._measured: deque[list[Tensor]] = deque([[]], longest + 1)
 
-    def step(self, input: Any) -> Gaussian:
-        """Goes on by a step with an applied input (m,); returns the belief after it."""
+    def step(self, input: Any = None) -> Gaussian:
+        """Goes on by a step with an applied input (m,); returns the belief after it.
+
+        The input may be left out where m = 0.
+        """
         acting = self.filter._as_input(self.belief, input)
         self.belief = self.filter.predict(self.belief, acting)
         self._inputs.append(acting)

@@ -83,6 +83,14 @@ def check_gp_tensors(
             raise SettingError(name, f"must be positive; got {tensors[name].tolist()}")
 
 
+def check_on_host(**tensors: Tensor) -> None:
+    """Raises ``SettingError`` of tensors that training cannot read where they are."""
+    for name, value in tensors.items():
+        if value.device.type != "cpu":
+            rule = f"must be in host memory for training ({name}.cpu())"
+            raise SettingError(name, f"{rule}; got {value.device}")
+
+
 def _check_finite(name: str, value: Tensor) -> None:
     """Raises ``DataError`` unless all entries are finite."""
     # A factor (k, N, N) is looked at output by output: no second copy is made.

@@ -24,7 +24,7 @@ from gpmpc.gp._prior_scales import (
     check_prior_settings,
 )
 from gpmpc.gp._scaling import Scaling
-from gpmpc.gp._tensor_checks import Predicts, check_gp_tensors
+from gpmpc.gp._tensor_checks import Predicts, check_gp_tensors, check_on_host
 
 _log = logging.getLogger(__name__)
 _NAMED_COLUMNS = 6  # columns that a line of the log names; of more it says how many
@@ -104,15 +104,8 @@ def read_training_data(
 
     Arguments and errors are those of ``Trainer.fit``.
     """
-    tensors = {"features": features, "targets": targets}
-    check_tensors(**tensors)
-    for name, value in tensors.items():
-        if value.device.type != "cpu":
-            raise SettingError(
-                name,
-                f"must be in host memory for training ({name}.cpu()); "
-                f"got {value.device}",
-            )
+    check_tensors(features=features, targets=targets)
+    check_on_host(features=features, targets=targets)
     check_gp_tensors(features, targets, input_dim, predicts)
     features = features.detach()
     targets = targets.detach()

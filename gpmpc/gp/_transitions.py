@@ -32,7 +32,7 @@ from gpmpc.exceptions import (
     check_number,
 )
 from gpmpc.gp._storage import brief, consistent, read_npz, write_npz
-from gpmpc.gp._tensor_checks import PREDICTS
+from gpmpc.gp._tensor_checks import PREDICTS, check_on_host
 from gpmpc.signals import UNKNOWN, Signals, check_signals, signals_of
 
 _NAMES = ("states", "inputs", "next_states")
@@ -362,6 +362,12 @@ def check_transitions(transitions: Any, model: Any = None) -> None:
         raise ShapeError(f"{rule}; got transitions with {n} and {m}")
     if model is not None:
         signals_of(model).check("the model", transitions.signals, "transitions")
+
+
+def check_rows_on_host(transitions: Any) -> None:
+    """Raises ``SettingError`` unless something is transitions in host memory."""
+    check_transitions(transitions)
+    check_on_host(**{name: getattr(transitions, name) for name in _NAMES})
 
 
 def follows_previous(transitions: Transitions, angles: Sequence[int] = ()) -> Tensor:

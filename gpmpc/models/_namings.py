@@ -34,10 +34,18 @@ def order_by_name(
 ) -> list[int] | None:
     """Returns where each own name stands among names, by the first that are the same.
 
-    None where none are. Names such as "state.angle" count as "angle".
+    None where none are. Names such as "state.angle" count as "angle", on both sides,
+    where whole names are not the same and these tell all entries apart.
     """
+    plain_own = [_without_prefix(name) for name in own]
     for names in namings:
-        plain = [name.rpartition(".")[2] for name in names]
-        if sorted(own) == sorted(plain):
-            return [plain.index(name) for name in own]
+        plain = [_without_prefix(name) for name in names]
+        for wanted, known in ((own, names), (plain_own, plain)):
+            if len(set(known)) == len(known) and sorted(wanted) == sorted(known):
+                return [list(known).index(name) for name in wanted]
     return None
+
+
+def _without_prefix(name: str) -> str:
+    """Returns a name behind its last dot."""
+    return name.rpartition(".")[2]

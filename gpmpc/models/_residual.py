@@ -39,7 +39,7 @@ from gpmpc.gp import (
 )
 from gpmpc.gp._data_checks import warn_of_transitions
 from gpmpc.gp._posterior import AffineForm
-from gpmpc.gp._transitions import check_transitions
+from gpmpc.gp._transitions import check_rows_on_host, check_transitions
 from gpmpc.gp._wrapped import warn_of_turns
 from gpmpc.models._casadi_function import CasadiFunction
 from gpmpc.models._features import Features
@@ -414,7 +414,7 @@ def train_residual(
     the difference of two states is learned. ``further_noise`` holds variances (n,) of
     what no output learns, which are added to the noise of those that do.
     """
-    check_transitions(transitions)
+    check_rows_on_host(transitions)
     if not hasattr(trainer, "fit"):
         rule = "must be a Trainer or SparseTrainer"
         raise SettingError("trainer", f"{rule}; got {trainer!r}")

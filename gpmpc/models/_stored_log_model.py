@@ -116,7 +116,7 @@ def log_model_parts(
     for name, part in _regressions(model).items():
         for key in _REGRESSION_TENSORS:
             tensors[f"{name}/{key}"] = torch.from_numpy(getattr(part, key))
-    if not model.memory.empty:
+    if model.memory != NO_MEMORY:
         header["memory"] = asdict(model.memory)
     if model.without_nominal:
         header["without_nominal"] = model.without_nominal
@@ -614,7 +614,8 @@ def _check_past(model: LogModel, input_dim: int, regressor_count: int) -> None:
         check_shape("time_constants", model.time_constants, (input_dim,))
         if (model.time_constants < 0).any():
             raise DataError("time_constants must not be negative")
-    if model.weights.size or not model.memory.empty:
+    seen_by_gps = any(gp.sees_memory for gp in model.gps)
+    if model.weights.size or not (model.memory.empty or seen_by_gps):
         check_shape("weights", model.weights, (outputs, regressor_count))
     without = model.without_nominal
     if not all(type(i) is int and 0 <= i < outputs for i in without):

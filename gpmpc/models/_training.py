@@ -15,7 +15,7 @@ import numpy as np
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, ShapeError, check_choice, check_kind
 from gpmpc.gp import Trainer, Training, Transitions, standardize
-from gpmpc.gp._transitions import check_transitions
+from gpmpc.gp._transitions import check_rows_on_host
 from gpmpc.models._features import Features
 from gpmpc.models._kinematic_rates import (
     KinematicResidual,
@@ -68,7 +68,8 @@ def train(
 
     Raises:
         SettingError: Trainer and settings are both given, a setting is unknown or out
-            of range, or names or time step of data and system differ.
+            of range, names or time step of data and system differ, or the data are not
+            in host memory.
         ShapeError: Data and system have other dimensions.
         TrainingError: An output could not be trained.
 
@@ -79,7 +80,7 @@ def train(
     >>> model.signals.state_names, model.angles
     (('angle', 'rate'), [0])
     """
-    check_transitions(transitions)
+    check_rows_on_host(transitions)
     check_choice("kinematics", kinematics, KINEMATICS)
     if trainer is not None and settings:
         raise SettingError(

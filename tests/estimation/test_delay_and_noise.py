@@ -88,6 +88,15 @@ def test_no_delay_is_tried_that_is_longer_than_the_longest():
     assert delays[-1] == 3.0
 
 
+def test_a_delay_that_may_be_longer_than_the_longest_is_said_in_the_log(caplog):
+    states, inputs = log(300, 3, 0)
+    estimate_delay(states, inputs, longest=4)
+    assert not caplog.messages
+    assert estimate_delay(states, inputs, longest=2).interval[1] > 2.0
+    (line,) = caplog.messages
+    assert "the longest delay that was tried, 2 steps: the delay may be longer" in line
+
+
 def test_states_that_rest_or_repeat_others_change_no_delay():
     states, inputs = log(300, 3, 0)
     uninformative = [np.full(301, 2.0), states[:, 0], states @ [1.0, -3.0]]

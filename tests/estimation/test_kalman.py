@@ -22,7 +22,7 @@ from gpmpc.estimation._conditioning import unexplained_covariance
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior
-from gpmpc.models import DelayedModel, DisturbedModel
+from gpmpc.models import DelayedModel, DisturbedModel, KnownModel
 from gpmpc.plotting import innovations_figure
 from gpmpc.propagation import (
     Linearization,
@@ -505,6 +505,16 @@ def test_an_unmeasured_disturbance_is_estimated_through_a_delay():
     assert float(belief.mean[2]) == pytest.approx(0.2, abs=0.01)
     assert torch.allclose(belief.mean[3:], queue[:, 0])
     assert 0 < float(belief.covariance[2, 2]) < 0.1
+
+
+def test_a_model_without_inputs_is_filtered_without_any():
+    model = KnownModel(lambda x, u: x @ A.mT, 2, 0)
+    filter = KalmanFilter.extended(model, Measurement.of_states(2, [0], [0.1]))
+    expected = Linearization()(model, PRIOR)
+    late = LateMeasurements(filter, PRIOR)
+    for belief in (filter.predict(PRIOR), filter.predict(PRIOR, None), late.step()):
+        assert torch.equal(belief.mean, expected.mean)
+        assert torch.equal(belief.covariance, expected.covariance)
 
 
 def test_errors_of_the_wrong_size_are_inconsistent():

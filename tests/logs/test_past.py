@@ -1,11 +1,15 @@
 """Models of logs that remember past rows, and inputs that act through lags."""
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from gpmpc.exceptions import SettingError
+from gpmpc.gp import GPPosterior
 from gpmpc.logs import (
     Log,
     LogMapping,
@@ -26,11 +30,19 @@ from gpmpc.logs._log import LogRun
 from gpmpc.logs._stability import grows_outside
 from gpmpc.logs._structure_fits import StructureFits
 from gpmpc.logs._structures import additions, bases
-from gpmpc.models import LogModel
+from gpmpc.models import LogDynamics, LogModel
 from gpmpc.models._kinematics import Increments
+from gpmpc.models._log_dynamics import OutputNoise
+from gpmpc.models._log_model import OutputGP
 from gpmpc.models._memory import Memory, Products
+from gpmpc.models._namings import order_by_name
 from gpmpc.models._parametric import AffineNominal
 from gpmpc.models._state_space import StateGroup, StateSpace
+from gpmpc.models._stored_log_model import (
+    NamedLogModel,
+    log_model_of_parts,
+    log_model_parts,
+)
 
 ROWS = Memory(rows=3, decays=(0.8,), output_decays=(0.5,))
 
@@ -247,6 +259,57 @@ def test_attitudes_that_grow_outside_of_their_data_are_seen():
     )
     assert not grows_outside(model, 1, 1.0)
     assert grows_outside(replace(model, weights=0.5 * np.eye(3, rows)), 1, 1.0)
+
+
+@pytest.mark.parametrize("remembers", ["rows, for GPs alone", "products of now alone"])
+def test_a_model_is_read_whatever_part_of_it_sees_the_memory(remembers):
+    groups = (StateGroup("x", ("x",)), StateGroup("v", ("v",)))
+    kinematics = Increments(StateSpace(groups))
+    products = Products(1, 2, (-1.0,) * 3, (1.0,) * 3)
+    memory = Memory(products=products)
+    parts = {"weights": np.ones((2, memory.regressor_dim(3, 2)))}
+    if remembers == "rows, for GPs alone":
+        memory = Memory(rows=1)
+        one = torch.ones(1).double()
+        points = torch.from_numpy(np.random.default_rng(1).normal(size=(9, 6)))
+        gp = GPPosterior.from_hyperparameters(
+            points, points[:, :1], one.expand(1, 6), one, one, 0, "value"
+        )
+        parts = {"gps": (OutputGP((1,), gp, sees_memory=True),)}
+    model = LogModel(
+        kinematics=kinematics,
+        nominal=AffineNominal(kinematics),
+        theta=np.linspace(0.0, 0.1, 8),
+        history=(0, 0),
+        memory=memory,
+        **parts,
+    )
+    noise = OutputNoise(np.ones((4, 2)), np.ones(2))
+    named = NamedLogModel(model, noise, ("x", "v"), ("u",), (), 0.1)
+    header, tensors = log_model_parts(Path("model"), named)
+    stored = json.loads(json.dumps(header))
+    again = log_model_of_parts(Path("model"), stored, tensors, ()).model
+    assert again.memory == memory
+    before, after = (LogDynamics(one, 1, 0.1) for one in (model, again))
+    states = np.random.default_rng(0).normal(size=(3, before.state_dim))
+    local = before.linearize(states, np.ones((3, 1)))
+    for one, other in zip(local, after.linearize(states, np.ones((3, 1))), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("own", "names", "order"),
+    [
+        (("angle", "rate"), ("state.rate", "state.angle"), [1, 0]),
+        (("arm.rate", "arm.angle"), ("arm.angle", "arm.rate"), [1, 0]),
+        (("gps.x", "imu.x"), ("imu.x", "gps.x"), [1, 0]),
+        (("a.rate", "a.angle"), ("b.angle", "b.rate"), [1, 0]),
+        (("a.x", "b.x"), ("c.x", "d.x"), None),
+        (("angle", "rate"), ("angle", "speed"), None),
+    ],
+)
+def test_names_with_prefixes_are_ordered_by_what_tells_them_apart(own, names, order):
+    assert order_by_name(own, [names]) == order
 
 
 def test_misuse_of_a_memory_is_named():

@@ -10,7 +10,7 @@ from gpmpc.calibration import Recording, calibrate
 from gpmpc.datasets import RandomData
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gp import GPPosterior, SparseTrainer, Trainer, Transitions, standardize
-from gpmpc.models import Features, ResidualModel, train
+from gpmpc.models import Affine, Features, ResidualModel, train
 from gpmpc.models._kinematic_rates import kinematic_residual
 from gpmpc.propagation import Linearization
 from gpmpc.signals import Signals
@@ -238,3 +238,11 @@ def test_what_does_not_belong_together_is_refused():
     other = replace(data, signals=Signals(["x", "v"], ["u"], 0.1))
     with pytest.raises(SettingError, match="the data has the states x, v"):
         train(other, system=plant)
+    elsewhere = replace(data)
+    object.__setattr__(elsewhere, "states", data.states.to("meta"))
+    for learn in (
+        lambda: train(elsewhere, system=plant),
+        lambda: ResidualModel.train(Affine.identity(2, 1), elsewhere),
+    ):
+        with pytest.raises(SettingError, match="states: must be in host memory for tr"):
+            learn()
