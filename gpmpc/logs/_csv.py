@@ -7,7 +7,7 @@ by part, so that the texts in its cells are counted before there are many.
 import gzip
 import io
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import pandas as pd
 
 from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import DataError
+from gpmpc.logs._csv_numbers import read_marked_numbers
 from gpmpc.logs._csv_text import DELIMITERS, WHITE_SPACE, CsvText, open_csv
 from gpmpc.logs._file import (
     NUMBER_BYTES,
@@ -50,10 +51,22 @@ def read_csv(path: Path, options: ReadOptions) -> LogFile:
     swallowed = csv.stream.rows - len(table)
     table.columns = _column_names(csv)
     units = dict(zip(table.columns, csv.units, strict=False))
-    table = unpack_lists(path, _without_empty_end(table), budget)
-    return LogFile(
-        {"": with_units(table, units)}, tuple(_findings(path, csv, swallowed))
+    table, unsure = read_marked_numbers(
+        str(path), _without_empty_end(table), csv.decimal
     )
+    table = unpack_lists(path, table, budget)
+    findings = (*_findings(path, csv, swallowed), *_unsure_marks(path, unsure))
+    return LogFile({"": with_units(table, units)}, findings)
+
+
+def _unsure_marks(path: Path, columns: Sequence[str]) -> Iterator[Finding]:
+    """Yields a finding of columns whose decimal mark may mark thousands."""
+    if columns:
+        text = (
+            f"the numbers of {', '.join(columns)} have three digits behind a mark, as "
+            "in 1,024: it is taken for the decimal mark; does it mark thousands?"
+        )
+        yield Finding("decimal mark", run_name(path), len(columns), text)
 
 
 def _column_names(csv: CsvText) -> list[str]:
@@ -143,6 +156,7 @@ def _read_in_parts(csv: CsvText, budget: MemoryBudget) -> pd.DataFrame:
         csv.stream,
         sep=r"\s+" if csv.delimiter == WHITE_SPACE else csv.delimiter,
         decimal=csv.decimal,
+        dtype=dict.fromkeys(csv.doubtful, str),
         header=None,
         names=range(csv.columns),
         chunksize=max(_CELLS_PER_PART // csv.columns, 1),

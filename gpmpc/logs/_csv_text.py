@@ -17,6 +17,7 @@ from itertools import chain, islice
 from typing import NamedTuple
 
 from gpmpc.exceptions import DataError
+from gpmpc.logs._csv_numbers import doubtful_columns
 from gpmpc.logs._units import is_known
 
 WHITE_SPACE = " "  # as a delimiter: any number of spaces and tabs
@@ -52,6 +53,9 @@ class CsvText(NamedTuple):
     columns: int  #: their number
     delimiter: str  #: ``WHITE_SPACE`` for any of it
     decimal: str
+    #: numbers of columns, from 0 on, that are to be read as texts: what the decimal
+    #: mark means in them is not sure (``_csv_numbers``)
+    doubtful: list[int]
     skipped: int  #: lines before the rows: neither names, nor units, nor comments
     head: int  #: lines before the rows, comments and blank ones left out
 
@@ -103,6 +107,7 @@ def open_csv(where: str, file: io.BufferedReader) -> CsvText:
         _check_decimal_commas(where, fields[first - 1 : first], rows)
     header = _find_header(head[:first], lines.comments, rows, delimiter)
     columns = max([len(header.names), *map(len, rows)])
+    decimal = _decimal_mark(rows)
     width = columns if delimiter == WHITE_SPACE else 0
     return CsvText(
         stream=_CsvStream(head[first:], lines, width),
@@ -110,7 +115,8 @@ def open_csv(where: str, file: io.BufferedReader) -> CsvText:
         units=header.units,
         columns=columns,
         delimiter=delimiter,
-        decimal=_decimal_mark(rows),
+        decimal=decimal,
+        doubtful=doubtful_columns(rows, decimal),
         skipped=header.skipped,
         head=first,
     )

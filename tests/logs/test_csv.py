@@ -65,6 +65,51 @@ def test_every_way_of_writing_numbers_is_read(tmp_path, content):
     np.testing.assert_allclose(table[["t", "x", "u"]], TABLE, rtol=1e-15)
 
 
+WHOLE_AT_FIRST = TABLE.assign(
+    t=10 * np.arange(300), x=TABLE["x"].where(TABLE.index > 60, 0), u=1.0
+)
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        WHOLE_AT_FIRST.map("{:.6g}".format).map(lambda text: text.replace(".", ",")),
+        TABLE.map("{:.6g}".format).assign(
+            x=[f"{x:.6g}".replace(".", ",") for x in TABLE["x"]]
+        ),
+        (1 + TABLE.abs()).map("{:.3f}".format).map(lambda text: text.replace(".", ",")),
+    ],
+)
+def test_decimal_commas_are_read_wherever_they_begin(tmp_path, table):
+    (tmp_path / "log.csv").write_text(table.to_csv(index=False, sep=";"))
+    numbers = table.map(lambda text: float(text.replace(",", ".")))
+    file = read_file(tmp_path / "log.csv")
+    np.testing.assert_array_equal(file.tables[""], numbers)
+    is_unsure = table["x"].str.contains("^[1-9],...$").all()
+    assert [finding.kind for finding in file.findings] == ["decimal mark"] * int(
+        is_unsure
+    )
+
+
+@pytest.mark.parametrize(
+    ("rows", "mark"),
+    [
+        ('0.00,"950"\n0.01,"1,024"\n', "comma"),
+        ('0,"950"\n10,"1,024"\n', "comma"),
+        ("0.00\t950\n0.01\t1,024\n", "comma"),
+        ("0;950\n" * 60 + "10;1,024\n", "comma"),
+        ("0;1,024\n" * 60 + "10;950\n", "comma"),
+        ("0,00;950\n0,01;1.024\n", "point"),
+        ("0;950\n10;1.024\n", "point"),
+    ],
+)
+def test_marks_of_thousands_are_refused(tmp_path, rows, mark):
+    delimiter = next(sign for sign in ";\t," if sign in rows)
+    (tmp_path / "log.csv").write_text(f"t{delimiter}rpm\n{rows}")
+    with pytest.raises(DataError, match=f"column 'rpm' .*950.* a decimal {mark}.*thou"):
+        read_file(tmp_path / "log.csv")
+
+
 @pytest.mark.parametrize(
     ("header", "unit", "said"),
     [
