@@ -97,7 +97,8 @@ class _Environment(Simulator):
         ):
             return False
         data: Any = getattr(inner, "data", None)
-        if not np.array_equal(np.concatenate([data.qpos, data.qvel]), self._now):
+        physics = np.concatenate([data.qpos, data.qvel])
+        if self._now is None or not np.array_equal(physics, self._now):
             return False
         inner.set_state(state[: model.nq], state[model.nq :])
         return True
