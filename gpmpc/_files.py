@@ -4,6 +4,7 @@ That holds whenever the process or the machine dies.
 """
 
 import os
+import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,7 +26,9 @@ def whole_file(path: str | Path, flush: bool = True) -> Iterator[BinaryIO]:
             whole whenever this process dies; where the machine does, it may be empty.
     """
     path = Path(path)
-    partial = path.parent / f".{path.name}.{os.getpid()}.partial"
+    # Processes of several machines may write to one folder at the same time.
+    writer = f"{platform.node()}.{os.getpid()}"
+    partial = path.parent / f".{path.name}.{writer}.partial"
     try:
         with partial.open("wb") as file:
             yield file
@@ -59,6 +62,29 @@ def remove_partial(folder: Path) -> None:
     """
     for partial in folder.glob(".*.partial"):
         partial.unlink(missing_ok=True)
+
+
+def folders_below(tree: str | Path) -> Iterator[tuple[str, list[str]]]:
+    """Yields every folder in a tree, itself included, and the names of its files.
+
+    Links to folders are followed, unless what they lead to is in the tree anyway.
+    """
+    seen: set[str] = set()
+    starts = [str(tree)]
+    while starts:
+        links: list[str] = []
+        for start in starts:
+            origin = os.path.realpath(start)
+            for folder, subfolders, files in os.walk(start):
+                real_folder = origin + folder[len(start) :]
+                if real_folder in seen:
+                    subfolders.clear()
+                    continue
+                seen.add(real_folder)
+                paths = [os.path.join(folder, name) for name in subfolders]
+                links += filter(os.path.islink, paths)
+                yield folder, files
+        starts = links
 
 
 def existing_file(path: str | Path, expected: str) -> Path:

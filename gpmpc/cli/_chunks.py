@@ -72,6 +72,7 @@ def fly_chunk(chunk: Chunk) -> None:
 
     Raises:
         GpmpcError: Runs could not be begun, for reasons that their folders cannot hold.
+            Those are all of the chunk that have not ended.
     """
     began = time.monotonic()
     problems: dict[str, None] = {}
@@ -84,7 +85,9 @@ def fly_chunk(chunk: Chunk) -> None:
             if not _fail(job, error):
                 problems[" ".join(str(error).split())] = None
         work = time.monotonic() - began
-        if chunk.most_work is not None and work > chunk.most_work:
+        is_long = chunk.most_work is not None and work > chunk.most_work
+        # What is left without an end counts as failed by the problems.
+        if is_long and not problems:
             break
     if problems:
         raise GpmpcError("; ".join(problems))
@@ -113,7 +116,8 @@ def _fail(job: Job, error: Exception) -> bool:
         "schema": 1,
         "choices": job.choices,
         "settings": {},
-        "provenance": provenance(),
+        # The command of this process may be a worker's, which finds no settings.
+        "provenance": provenance() | {"command": job.settings.command(job.choices)},
     }
     try:
         with job.folder.locked(wait=False):

@@ -100,14 +100,31 @@ def choices(overrides: Iterable[str]) -> list[str]:
     """Returns what distinguishes a run, ``key=value`` each in Hydra's own spelling.
 
     They name its folder, and are the ``choices`` of its results.
-    Of a key given twice, the last counts.
+    Of a key given twice, the last counts. They are sorted, unless one changes a part
+    of another: then a command needs their order.
     """
-    by_key = {}
+    by_key: dict[str, str] = {}
     for word in overrides:
         override = read_override(word)
         if not override.is_aside:
+            by_key.pop(override.key, None)  # it stands where it was given last
             by_key[override.key] = override.choice
+    if _some_overlap(by_key):
+        return [*by_key.values()]
     return sorted(by_key.values())
+
+
+def _some_overlap(keys: Iterable[str]) -> bool:
+    """Whether one of some settings is another one, or inside of it."""
+    names = [_name_of(key) for key in keys]
+    distinct = {*names}
+    if len(distinct) < len(names):
+        return True
+    for name in names:
+        *outer, _ = name.split(".")
+        if any(".".join(outer[: i + 1]) in distinct for i in range(len(outer))):
+            return True
+    return False
 
 
 def folder_choice(overrides: Iterable[str]) -> list[str]:
@@ -135,6 +152,7 @@ def combinations(overrides: Sequence[str]) -> Iterator[list[str]]:
     loader = hydra.config_loader() if hydra.is_initialized() else None
     for override in OverridesParser.create(loader).parse_overrides([*overrides]):
         key = override.get_key_element()
+        by_key.pop(key, None)  # it stands where it was given last
         if not override.is_sweep_override():
             by_key[key] = [str(override.input_line)]
             continue

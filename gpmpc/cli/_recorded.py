@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gpmpc._files import folders_below
 from gpmpc._provenance import is_of_this_code
 from gpmpc._trust import trusted_packages
 from gpmpc.cli._folders import find_modules_here
@@ -31,7 +32,11 @@ def recordings(run: Path) -> list[Path]:
         return [run]
     if (run / RECORDING).exists():
         return [run / RECORDING]
-    paths = sorted(run.rglob(RECORDING))
+    paths = sorted(
+        Path(folder, RECORDING)
+        for folder, files in folders_below(run)
+        if RECORDING in files
+    )
     if not paths:
         raise DataError(f"{run}: holds no {RECORDING}, nor does a folder below it")
     return paths

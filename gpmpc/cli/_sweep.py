@@ -93,8 +93,9 @@ class Sweep:
         self.flown_again: set[str] = set()
         #: attempts of runs that were ended too often, by folder; they do not fly again
         self.given_up: dict[str, int] = {}
-        #: folders of runs whose result is damaged: another process wrote it so
-        self.unreadable: set[Path] = set()
+        #: folders of finished runs that are none of this sweep: another process wrote
+        #: a damaged result, or flew other settings
+        self.unusable: set[Path] = set()
         self._remarks: set[str] = set()  # that were printed, without their numbers
 
     def close(self) -> None:
@@ -131,7 +132,11 @@ class Sweep:
             f"comparing the settings of {len(finished)} finished runs"
         ):
             for job in finished:
-                self._check_finished(job)
+                try:
+                    self._check_finished(job)
+                except DataError:
+                    if job.folder.finished:  # else it is gone since, and flown again
+                        raise
         self._index.write()
         for job in finished[-_MEASURED:]:
             self._chunking.measure(job)
@@ -225,10 +230,10 @@ class Sweep:
             return JobOutcome(str(folder), job.folder.error())
         try:
             result = job.folder.result()
-        except DataError as error:
-            self.unreadable.add(folder)
+            fingerprint = self._compared_fingerprint(job, result)
+        except (DataError, SettingError) as error:
+            self.unusable.add(folder)
             return JobOutcome(str(folder), str(error))
-        fingerprint = self._compared_fingerprint(job, result)
         self._add_to_index(folder / METRICS, result, fingerprint)
         self._index.write()
         warning = warning_of(result)
@@ -237,21 +242,19 @@ class Sweep:
         return JobOutcome(str(folder))
 
     def _compared_fingerprint(self, job: Job, result: Mapping[str, Any]) -> str | None:
-        """Returns the fingerprint of a job's settings if its finished run has them.
+        """Returns the fingerprint of a job's settings, which its finished run has.
 
-        Else None, and a line says so: the file of a model was written anew while the
-        sweep flew, or another sweep of other settings finished the run.
+        None where they have none.
+
+        Raises:
+            SettingError: The run has other settings: the file of a model was written
+                anew while the sweep flew, or another sweep finished the run.
         """
         fingerprint = job.settings.fingerprint()
         flown = (result.get("provenance") or {}).get("settings_fingerprint")
-        if fingerprint in (None, flown):
-            return fingerprint
-        try:
+        if fingerprint is None or fingerprint != flown:
             settings = plain_settings(job.settings.config(), job.settings.options)
             job.folder.result(settings)
-        except SettingError as error:
-            print_error(str(error))
-            return None
         return fingerprint
 
     @contextmanager
@@ -369,7 +372,7 @@ def sweep(arguments: Namespace) -> Result:
             if not error.has_launched:
                 raise
             return cannot_go_on(runs.tree, str(error))
-    end = _end_of(jobs, outcomes, finished_before, runs.unreadable)
+    end = _end_of(jobs, outcomes, finished_before, runs.unusable)
     text = f"{end.line()}{_count_warnings(runs.warnings)}; in {runs.tree}"
     console.out(text, highlight=False)
     runs.print_other_code()
@@ -436,10 +439,10 @@ def _end_of(
     jobs: Sequence[Job],
     outcomes: Sequence[JobOutcome],
     finished_before: Set[Path],
-    unreadable: Set[Path],
+    unusable: Set[Path],
 ) -> _SweepEnd:
     """Counts what is there: another sweep may have flown what failed in this one."""
-    finished = {job.folder.path for job in jobs if job.folder.finished} - unreadable
+    finished = {job.folder.path for job in jobs if job.folder.finished} - unusable
     failed = [
         outcome
         for outcome in outcomes
@@ -459,7 +462,7 @@ def _write_plan(tree: Path, jobs: Sequence[Job], options: Sequence[str]) -> Path
     Equal sweeps write the same file, which is returned. ``options`` are those of the
     command by which its settings are found.
     """
-    content: dict[str, Any] = {"runs": [job.choices for job in jobs]}
+    content: dict[str, Any] = {"runs": [sorted(job.choices) for job in jobs]}
     if options:
         content["search_options"] = shlex.join(options)
     plan = json.dumps(content, indent=1) + "\n"

@@ -151,7 +151,10 @@ class RunIndex:
         line = self._lines.get(path.parent.name)
         if line is None or line.file != path.name:
             return None
-        status = os.stat(path)
+        try:
+            status = os.stat(path)
+        except FileNotFoundError:
+            return None
         if (status.st_mtime_ns, status.st_size) != (line.written, line.size):
             return None
         return line

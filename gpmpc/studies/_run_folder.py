@@ -1,7 +1,7 @@
 """Keeps a run in a folder: is it finished, what are its results, what made it.
 
     config.yaml    the resolved settings
-    run.mcap       every step
+    run.mcap       every step; episode_1.mcap and so on, those of earlier episodes
     metrics.json   the results; written last and in one piece: where it is, the run is
                    finished
     error.json     why it failed, where it did
@@ -41,6 +41,7 @@ METRICS = "metrics.json"
 ERROR = "error.json"
 CONFIG = "config.yaml"
 RECORDING = "run.mcap"
+EPISODES = "episode_*.mcap"  # recordings of the flights that it learned from
 PLAN_PREFIX = "sweep-"  # beginning of the names of the files that list a sweep's runs
 _LOCK = ".lock"  # stays, and says who worked on the folder last
 _EARLIER_ERROR = ".error.json"
@@ -190,12 +191,14 @@ class RunFolder:
     def begin(self, config: str) -> None:
         """Puts aside how an earlier attempt ended, and keeps the resolved settings.
 
-        A result goes: the recording that it belongs to is written anew.
+        Its result and its recordings go: they are of the attempt before.
         """
         with suppress(FileNotFoundError):
             os.replace(self.path / ERROR, self.path / _EARLIER_ERROR)
         write_whole(self.path / CONFIG, config, flush=False)
         (self.path / METRICS).unlink(missing_ok=True)
+        for recording in (self.path / RECORDING, *self.path.glob(EPISODES)):
+            recording.unlink(missing_ok=True)
 
     def finish(self, result: Mapping[str, Any]) -> None:
         """Makes the run a finished one, without a trace of earlier failures.

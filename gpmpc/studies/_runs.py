@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import pandas as pd
 
+from gpmpc._files import folders_below
 from gpmpc.exceptions import DataError
 from gpmpc.studies._document import plain_text
 from gpmpc.studies._index import RunIndex
@@ -215,7 +216,7 @@ class _Paths:
         """Looks for them; the metrics of a run stand for an older error."""
         results: dict[str, list[str]] = {ERROR: [], METRICS: []}  # folders
         plans: list[Path] = []
-        for folder, _, files in os.walk(tree):
+        for folder, files in folders_below(tree):
             for name, folders in results.items():
                 if name in files:
                     folders.append(folder)

@@ -1,6 +1,7 @@
 """Runs of a sweep in chunks: how many a process flies, and which are tried before."""
 
 import errno
+import json
 import logging
 import os
 import re
@@ -20,7 +21,13 @@ from gpmpc.cli._settings import model_file, settings_folders
 from gpmpc.cli._sweep import JobOutcome, Sweep, _end_of, _EndCounter
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.studies._index import RunIndex
-from gpmpc.studies._run_folder import Busy, RunFolder, RunState, folder_name
+from gpmpc.studies._run_folder import (
+    Busy,
+    RunFolder,
+    RunState,
+    folder_name,
+    run_header,
+)
 from tests.studies.made_up import metrics_of
 
 
@@ -119,6 +126,8 @@ def test_a_chunk_goes_on_behind_what_cannot_be_flown(tmp_path, monkeypatch):
     assert states == [RunState.NOT_BEGUN] * 2 + [RunState.FAILED] * 2 + states[:1]
     assert jobs[2].folder.error() == "model.path: cannot read m"
     assert jobs[2].folder.outside_attempts == 0
+    about = json.loads((jobs[2].folder.path / "error.json").read_text())
+    assert about["provenance"]["command"] == "gpmpc run seed=2"
     flown.clear()
     fly_chunk(Chunk(tuple(jobs[2:]), most_work=0.0))
     assert flown == [2]  # it always flies one
@@ -129,6 +138,10 @@ def test_a_chunk_goes_on_behind_what_cannot_be_flown(tmp_path, monkeypatch):
     monkeypatch.setattr(RunFolder, "fail", refuse)
     with pytest.raises(GpmpcError, match=r"\Amodel.path: cannot read m\Z"):
         fly_chunk(Chunk(tuple(jobs), None))
+    flown.clear()
+    with pytest.raises(GpmpcError):  # which is said of all that have not ended
+        fly_chunk(Chunk(tuple(jobs[2:]), most_work=0.0))
+    assert flown == [2, 3, 4]
 
 
 class Death(BaseException):
@@ -193,7 +206,7 @@ def test_every_choice_and_both_ends_are_tried(tmp_path):
 
 @pytest.mark.parametrize("content", [b"1", b"2"], ids=["same", "changed"])
 def test_a_sweep_remembers_only_the_settings_that_a_run_has(
-    content, tmp_path, monkeypatch, capsys
+    content, tmp_path, monkeypatch
 ):
     model = tmp_path / "model.safetensors"
     model.write_bytes(b"1")
@@ -211,14 +224,15 @@ def test_a_sweep_remembers_only_the_settings_that_a_run_has(
     )
     runs = Sweep("run", words, Console(quiet=True))
     job = runs.job(words)
-    assert [outcome.error for outcome in runs.fly([job])] == [None]
+    (outcome,) = runs.fly([job])
+    is_same = content == b"1"
+    assert ("of other settings (model.sha256" in str(outcome.error)) == (not is_same)
+    assert (outcome.error is None) == is_same
+    assert runs.unusable == ({job.folder.path} if outcome.error else set())
     path = job.folder.path / "metrics.json"
     known = RunIndex(tmp_path / "tree").record_with(path, job.settings.fingerprint())
     assert (known is not None) == (content == b"1")
     assert len(compared) == (content == b"2")  # only where it is needed: it takes long
-    assert ("of other settings (model.sha256" in capsys.readouterr().err) == (
-        content == b"2"
-    )
 
 
 def test_the_bar_may_look_while_all_are_looked_at():
@@ -263,7 +277,7 @@ def test_what_is_gone_or_damaged_is_not_counted_as_flown(tmp_path):
         path.mkdir(parents=True)
         (path / "metrics.json").write_text("{}")
     outcomes = [JobOutcome(str(flown)), JobOutcome(str(damaged), "it is damaged")]
-    end = _end_of(jobs, outcomes, finished_before={gone}, unreadable={damaged})
+    end = _end_of(jobs, outcomes, finished_before={gone}, unusable={damaged})
     said = "3 runs: 1 flown, 0 finished before, 1 failed, 1 gone"
     assert end.line() == said
 
@@ -271,3 +285,41 @@ def test_what_is_gone_or_damaged_is_not_counted_as_flown(tmp_path):
 def test_a_model_s_file_is_known_by_its_ending():
     for name in ("arm.safetensors", "arm.npz", "'my arm.npz'"):
         assert model_file(f"model={name}") == ["model=saved", f"model.path={name}"]
+
+
+def test_a_run_that_another_process_flew_with_other_settings_has_failed(
+    tmp_path, monkeypatch
+):
+    """Also where settings ask for what no text of theirs tells."""
+    monkeypatch.setenv("GAIN", "0.5")
+    words = ["disturbance_gain=${oc.env:GAIN}", f"folder={tmp_path / 'tree'}"]
+
+    def flight(run, *_):
+        other = run_header(run.choices, {"disturbance_gain": 0.1}, run.command)
+        run.folder.path.mkdir(parents=True)
+        run.folder.finish(other | metrics_of(0.1))
+        raise Busy("another process works on this run")
+
+    monkeypatch.setattr(_run, "run_one", lambda run, wait: flight(run))
+    runs = Sweep("run", words, Console(quiet=True))
+    job = runs.job(words)
+    assert job.settings.fingerprint() is None
+    (outcome,) = runs.fly([job])
+    assert "holds a finished run of other settings" in outcome.error
+    end = _end_of([job], [outcome], finished_before=set(), unusable=runs.unusable)
+    assert (end.finished_now, end.failed) == (0, [outcome])
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["b=1", "a=2"], ["a=2", "b=1"]),
+        (["p={m:1}", "b=3", "p.m=2"], ["p={m:1}", "b=3", "p.m=2"]),
+        (["p.m=2", "b=3", "p={m:1}"], ["p.m=2", "b=3", "p={m:1}"]),
+        (["p.m=1", "p={m:1}", "p.m=2"], ["p={m:1}", "p.m=2"]),
+        (["b=3", "++b=2"], ["b=3", "++b=2"]),
+    ],
+)
+def test_choices_of_one_setting_keep_their_order(words, expected):
+    assert choices(words) == expected
+    assert choices(next(combinations(words))) == expected

@@ -16,6 +16,7 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from gpmpc.cli._overrides import read_override
+from gpmpc.cli._recorded import recordings
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import Series, over_variable
 from gpmpc.studies import report as reporting
@@ -681,3 +682,20 @@ def test_options_that_are_no_words_of_a_command_are_told(tmp_path):
     (tmp_path / "sweep-1.json").write_text(json.dumps(content))
     (line,) = read_report(tmp_path).skipped
     assert line.endswith("is not what a sweep writes: ValueError: No closing quotation")
+
+
+def test_runs_behind_links_are_found_once(tmp_path):
+    tree = tmp_path / "tree"
+    for seed in range(2):
+        add(tree, "lqr", seed, 0.1)
+        (folder_of(tree, chosen("lqr", seed)[0]) / "run.mcap").touch()
+    plan(tree, [chosen("lqr", seed)[0] for seed in range(2)])
+    moved = folder_of(tree, chosen("lqr", 1)[0])
+    moved.rename(tmp_path / "elsewhere")
+    moved.symlink_to(tmp_path / "elsewhere")
+    (tree / "a_best").symlink_to(folder_of(tree, chosen("lqr", 0)[0]))
+    (tmp_path / "elsewhere" / "all").symlink_to(tmp_path)
+    report = read_report(tree)
+    assert [*report.runs.state] == ["finished", "finished"]
+    assert report.repeated == ()
+    assert len(recordings(tree)) == 2

@@ -181,8 +181,11 @@ def test_a_folder_alone_tells_how_far_its_run_is(tmp_path):
     with folder.locked():
         folder.fail(ValueError("no"), {})
     assert folder.state is RunState.FAILED
+    for name in ("run.mcap", "episode_1.mcap", "mine.mcap"):
+        (folder.path / name).touch()
     with folder.locked():
         folder.begin("steps: 1\n")
+        assert [path.name for path in folder.path.glob("*.mcap")] == ["mine.mcap"]
         assert folder.state is RunState.RUNNING
         folder.finish({"settings": {}})
     assert folder.state is RunState.FINISHED
