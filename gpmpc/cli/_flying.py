@@ -15,8 +15,8 @@ One that its process could not finish is a failed run with the reason in its
 
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Protocol
@@ -131,22 +131,35 @@ class Flying:
         if ends is None:
             return False
         unseen: list[tuple[_OpenJob, ChunkEnd]] = []
-        for end in ends:
-            if end.was_adopted:
-                # Its runs may have failed before this sweep looked.
-                for open_job in self._open_jobs(end.chunk):
-                    open_job.ignored_failure_at = None
-            if end.cause is not None:
-                self._settle_dead_chunk(end)
-                continue
-            unsettled = self._unsettled(end.chunk)
-            # A chunk may stop after any of its runs, and leave the others.
-            if len(unsettled) == len(end.chunk.folders):
-                unseen += [(open_job, end) for open_job in unsettled]
+        with closing(ends):  # at once where an interrupt comes
+            for end in ends:
+                if end.adopted_from is not None:
+                    self._count_failures_since(end.adopted_from, end.chunk)
+                if end.cause is not None:
+                    self._settle_dead_chunk(end)
+                    continue
+                unsettled = self._unsettled(end.chunk)
+                # A chunk may stop after any of its runs, and leave the others.
+                if len(unsettled) == len(end.chunk.folders):
+                    unseen += [(open_job, end) for open_job in unsettled]
         self._judge_unseen(unseen)
         return True
 
-    def _launch(self, running: Sequence[Chunk]) -> Iterator[ChunkEnd] | None:
+    def _count_failures_since(self, launched: int, chunk: Chunk) -> None:
+        """Lets failures of an adopted chunk count, also those before this sweep looked.
+
+        Args:
+            launched: When the chunk was [ns]; what failed before is of an earlier call.
+            chunk: Whose runs they are.
+        """
+        for open_job in self._open_jobs(chunk):
+            failed_at = open_job.job.folder.failed_at
+            if failed_at is not None and failed_at > launched:
+                open_job.ignored_failure_at = None
+
+    def _launch(
+        self, running: Sequence[Chunk]
+    ) -> Generator[ChunkEnd, None, None] | None:
         """Launches the jobs that nobody works on; None where there is none."""
         in_hand = {path for chunk in running for path in _paths(chunk)}
         to_fly = []

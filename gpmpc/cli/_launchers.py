@@ -11,7 +11,7 @@ jobs of Slurm (``_slurm``), and as tasks of Ray (``_ray``).
 import os
 import re
 import socket
-from collections.abc import Callable, Iterator, Sequence, Set
+from collections.abc import Callable, Generator, Sequence, Set
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
@@ -78,8 +78,9 @@ class ChunkEnd:
     cause: Cause | None = None
     #: the cause in a line
     reason: str = ""
-    #: whether another call had launched it, and this one found it running
-    was_adopted: bool = False
+    #: when another call launched it, which this one found running [ns]; None where
+    #: this one did
+    adopted_from: int | None = None
 
 
 class Refused(GpmpcError):
@@ -123,7 +124,9 @@ class Launcher(Protocol):
         """
         ...
 
-    def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
+    def launch(
+        self, work: Work, chunks: Sequence[Chunk]
+    ) -> Generator[ChunkEnd, None, None]:
         """Starts ``chunks``, and yields how they and the adopted ones end.
 
         Adopted are those that the last call of ``running`` returned.
@@ -178,7 +181,9 @@ class Basic:
     def running(self, paths: Set[str]) -> Sequence[Chunk]:
         return ()
 
-    def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
+    def launch(
+        self, work: Work, chunks: Sequence[Chunk]
+    ) -> Generator[ChunkEnd, None, None]:
         for chunk in chunks:
             try:
                 work(chunk)
@@ -247,7 +252,9 @@ class Joblib:
     def running(self, paths: Set[str]) -> Sequence[Chunk]:
         return ()
 
-    def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
+    def launch(
+        self, work: Work, chunks: Sequence[Chunk]
+    ) -> Generator[ChunkEnd, None, None]:
         waiting = list(reversed(chunks))
         flying: dict[Future[Any], tuple[Chunk, ProcessPoolExecutor]] = {}
         try:

@@ -3,7 +3,7 @@
 import logging
 import os
 import socket
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Generator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager, nullcontext
 from importlib import import_module
 from pathlib import Path
@@ -64,7 +64,9 @@ class Ray:
         """Returns none: Ray ends the tasks of a sweep that is killed."""
         return ()
 
-    def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
+    def launch(
+        self, work: Work, chunks: Sequence[Chunk]
+    ) -> Generator[ChunkEnd, None, None]:
         """Submits chunks; yields how they end.
 
         Raises:

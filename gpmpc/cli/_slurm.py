@@ -16,7 +16,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Generator, Iterator, Mapping, Sequence, Set
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -45,6 +45,8 @@ _SILENCE = 60.0  # of Slurm, after which that is said [s]
 _PATIENCE = 60.0  # for the answer of one of its commands [s]
 _TAIL = 4000  # characters of a log that are read
 _FORMAT = "%j|%K|%F_%K|%T|%r|%N"
+_FIELDS = 1 + _FORMAT.count("|")
+_COMMANDS = ("sbatch", "squeue", "scontrol", "scancel")
 
 _CAUSES = {
     "CANCELLED": Cause.CANCELLED,
@@ -100,7 +102,8 @@ class _Array:
     chunks: Sequence[Chunk]
     timeout_min: int  # wall time of its jobs [min]
     mem_gb: float  # memory of its jobs [GB]
-    was_adopted: bool = False  # whether another call submitted it
+    #: when another call submitted it [ns]; None where this one did
+    adopted_from: int | None = None
     #: chunks whose jobs may not have ended yet
     waiting: set[int] = field(default_factory=set)
     #: looks at the queue without a job, by chunk
@@ -152,10 +155,12 @@ class Slurm:
                 "holds #SBATCH, which would be ignored; options of sbatch are "
                 "additional_parameters",
             )
-        if shutil.which("sbatch") is None:
-            raise SettingError(
-                "launcher", "slurm needs sbatch; start the sweep on a login node"
-            )
+        for command in _COMMANDS:
+            if shutil.which(command) is None:
+                raise SettingError(
+                    "launcher",
+                    f"slurm needs {command}; start the sweep on a login node",
+                )
         self._at_once = array_parallelism
         self._setup = [*setup]
         self._logs = tree / _LOGS
@@ -194,7 +199,9 @@ class Slurm:
             array.chunks[index] for array in self._adopted for index in array.waiting
         ]
 
-    def launch(self, work: Work, chunks: Sequence[Chunk]) -> Iterator[ChunkEnd]:
+    def launch(
+        self, work: Work, chunks: Sequence[Chunk]
+    ) -> Generator[ChunkEnd, None, None]:
         """Submits chunks; yields how they, and the adopted ones, end.
 
         Where Slurm refuses one array after others, such as by a limit of jobs a user,
@@ -245,6 +252,7 @@ class Slurm:
         It may be of another gpmpc, whose classes are not there any more.
         """
         try:
+            written = (folder / CHUNKS).stat().st_mtime_ns
             content = pickle.loads((folder / CHUNKS).read_bytes())
             chunks = [pickle.loads(chunk) for chunk in content["chunks"]]
         except Exception as error:  # whatever unpickling raises
@@ -260,7 +268,7 @@ class Slurm:
             chunks,
             timeout_min=content.get("timeout_min", self._timeout_min),
             mem_gb=content.get("mem_gb", self._mem_gb),
-            was_adopted=True,
+            adopted_from=written,
             waiting={*range(len(chunks))},
         )
 
@@ -279,7 +287,8 @@ class Slurm:
         options = self._options | {
             "job-name": name,
             "array": f"0-{len(chunks) - 1}%{at_once}",
-            "output": f"{folder}/%a.log",
+            # sbatch replaces what follows a % in the folder, too
+            "output": f"{str(folder).replace('%', '%%')}/%a.log",
             "open-mode": "append",
             "chdir": Path.cwd(),
         }
@@ -313,7 +322,7 @@ class Slurm:
         ]
         return "\n".join(lines) + "\n"
 
-    def _watch(self, arrays: Sequence[_Array]) -> Iterator[ChunkEnd]:
+    def _watch(self, arrays: Sequence[_Array]) -> Generator[ChunkEnd, None, None]:
         """Looks at the queue until all jobs of the arrays have ended; yields ends."""
         interval = _FIRST_LOOK
         last_answer = time.monotonic()
@@ -340,7 +349,8 @@ class Slurm:
                 if any(array.waiting for array in arrays):
                     time.sleep(interval)
                 interval = min(_SLOWER * interval, _LAST_LOOK)
-        except KeyboardInterrupt:
+        # Who consumes the ends may be interrupted, too, and closes this generator.
+        except (KeyboardInterrupt, GeneratorExit):
             for array in arrays:
                 if array.waiting:
                     print_error(f"jobs go on; to end them: scancel -n {array.name}")
@@ -407,7 +417,7 @@ class Slurm:
             outcome = self._reason(cause, array, job, log)
             reason = f"job {number}{on_host} {outcome}"
         return ChunkEnd(
-            array.chunks[index], host, cause, reason, was_adopted=array.was_adopted
+            array.chunks[index], host, cause, reason, adopted_from=array.adopted_from
         )
 
     def _reason(
@@ -537,8 +547,11 @@ def _jobs_of(listing: str) -> dict[tuple[str, int], _Job]:
     """Returns the jobs that squeue lists, by array's name and index."""
     jobs = {}
     for line in listing.splitlines():
-        name, index, *job = line.split("|")
-        if name.startswith(_PREFIX) and index.isdecimal() and len(job) == 4:
+        fields = line.split("|")
+        if len(fields) != _FIELDS:  # such as "CLUSTER: name" above those of a cluster
+            continue
+        name, index, *job = fields
+        if name.startswith(_PREFIX) and index.isdecimal():
             jobs[name, int(index)] = _Job(*job)
     return jobs
 
@@ -553,7 +566,10 @@ def _accounted(name: str) -> dict[int, _Job]:
         return {}
     jobs = {}
     for line in answer.stdout.splitlines():
-        number, state, host = line.split("|")
+        fields = line.split("|")
+        if len(fields) != 3:
+            continue
+        number, state, host = fields
         index = number.rpartition("_")[2]
         state = state.partition(" ")[0]  # of "CANCELLED by 1000"
         if index.isdecimal() and state in _ENDED_STATES:

@@ -140,13 +140,26 @@ class Report:
             ["cell", "sweep", "search_options", "typed", "names_seed"]
         )
         for (_, sweep, options, overrides, names_seed), runs in groups:
-            command = ["gpmpc", "run", "-m", *shlex.split(options), *overrides]
+            words = self._varied_last(overrides)
+            command = ["gpmpc", "run", "-m", *shlex.split(options), *words]
             # Only where all of them name it is the column the seeds that were typed.
             if names_seed:
                 command.append(f"{SEED}={','.join(runs.seed)}")
             command.append(folder_override(sweep))
             commands.append(plain_text(shlex.join(command)))
         return commands
+
+    def _varied_last(self, overrides: Sequence[str]) -> Sequence[str]:
+        """Returns overrides with what all runs share first, unless their order counts.
+
+        They are sorted where it does not.
+        """
+        if [*overrides] != sorted(overrides):
+            return overrides
+        return sorted(
+            overrides,
+            key=lambda word: word.partition("=")[0].lstrip("+") in self.variables,
+        )
 
 
 def read_report(tree: str | Path) -> Report:

@@ -46,10 +46,13 @@ for name in $(cat "$FAKE/names"); do
   done < "$FAKE/queue"
 done
 echo "somebody's|N/A|8_N/A|RUNNING|None|n1"
+echo
+echo "CLUSTER: other"
 """
 SACCT = """#!/bin/sh
 [ -e "$FAKE/accounts" ] || exit 1
 while IFS='|' read -r index state reason host; do
+  echo
   echo "7_$index|$state|$host"
 done < "$FAKE/accounts"
 """
@@ -276,6 +279,42 @@ def test_the_jobs_of_a_killed_sweep_are_watched_and_not_flown_twice(fake, tree):
     assert Slurm(tree).running(paths) == []
 
 
+def test_a_failure_before_a_job_was_submitted_is_none_of_its(fake, tree):
+    jobs = jobs_of(tree, "flies", "flies")
+    jobs[1].folder.path.mkdir(parents=True)
+    jobs[1].folder.fail(ValueError("in an earlier call"), {})
+    Slurm(tree).launch(fly, in_chunks(2)(jobs))
+    fly(in_chunks(1)(jobs)[0])  # it had a long one, and left the other
+    (fake / "queue").write_text("0|COMPLETED|None|n1\n")
+    (next(tree.glob(".slurm/gpmpc-*")) / "0.log").write_text("gpmpc: done on n1\n")
+    assert outcomes(tree, jobs, flown_before=["1-flies"]) == ["finished", "finished"]
+
+
+def test_who_interrupts_a_sweep_is_told_how_its_jobs_end(fake, tree, capsys):
+    def interrupt(job, state):
+        raise KeyboardInterrupt
+
+    def chunked(jobs):
+        first, second = in_chunks(1)(jobs)
+        fly(first)
+        return first, second
+
+    jobs = jobs_of(tree, "flies", "flies")
+    (fake / "queue").write_text("0|COMPLETED|None|n1\n1|RUNNING|None|n1\n")
+    flying = Flying(Slurm(tree), fly, chunked, interrupt, retries=0)
+    with pytest.raises(KeyboardInterrupt):
+        flying.fly(jobs)
+    (array,) = tree.glob(".slurm/gpmpc-*")
+    assert f"to end them: scancel -n {array.name}" in capsys.readouterr().err
+
+
+def test_logs_lie_in_the_folder_whatever_its_name(fake, tmp_path):
+    Slurm(tmp_path / "95%u").launch(fly, in_chunks(1)(jobs_of(tmp_path, "flies")))
+    assert (
+        f"--output={tmp_path}/95%%u/.slurm/gpmpc-" in (fake / "submitted").read_text()
+    )
+
+
 def test_chunks_of_another_gpmpc_are_told_and_left(fake, tree, capsys):
     (job,) = jobs_of(tree, "flies")
     Slurm(tree).launch(fly, in_chunks(1)([job]))
@@ -382,4 +421,12 @@ def test_the_page_s_settings_are_taken():
 def test_without_slurm_its_launcher_says_where_to_start(tree, monkeypatch):
     monkeypatch.setenv("PATH", "")
     with pytest.raises(SettingError, match="start the sweep on a login node"):
+        Slurm(tree)
+
+
+def test_every_command_of_slurm_is_needed(fake, tree, tmp_path, monkeypatch):
+    programs = tmp_path / "programs"
+    (programs / "squeue").unlink()
+    monkeypatch.setenv("PATH", str(programs))
+    with pytest.raises(SettingError, match="slurm needs squeue; start the sweep"):
         Slurm(tree)

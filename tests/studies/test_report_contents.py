@@ -359,9 +359,9 @@ def test_a_report_says_of_every_run_what_became_of_it(tmp_path):
         " double quotes: line 1 column 2 (char 1)\n\n"
     )
     assert tail == (
-        f"## To fill the gaps\n\n```\ngpmpc run -m controller=convex horizon=10 "
+        f"## To fill the gaps\n\n```\ngpmpc run -m horizon=10 controller=convex "
         f"seed=3 folder={tree}\n"
-        f"gpmpc run -m controller=lqr horizon=10 seed=1,3 folder={tree}\n```\n\n"
+        f"gpmpc run -m horizon=10 controller=lqr seed=1,3 folder={tree}\n```\n\n"
         "## Settings of all runs\n\n```\ndata.size: null\nhorizon: 10\n```\n"
     )
     origins = [run.origin for run in report.ended]
