@@ -22,6 +22,7 @@ from gpmpc.cli._folders import find_modules_here, write_files, writing
 from gpmpc.cli._terminal import print_error
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.logs import IdentifiedModel, Judgement, Log
+from gpmpc.logs._control_fitness import unflown_disturbance
 from gpmpc.logs._fitting import PAST
 from gpmpc.logs._judging import (
     check_held_out,
@@ -34,6 +35,7 @@ from gpmpc.logs._judging import (
 from gpmpc.logs._learning import fewest_rows
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._structures import affordable_rows_back, past_rows_needed
+from gpmpc.models._parametric import is_still
 from gpmpc.plotting import judgement_figure, png
 from gpmpc.studies._document import Document, Table, number, terminal
 from gpmpc.studies._run_folder import describe_code
@@ -381,7 +383,10 @@ def _make_report(
         lists["Why the model should not be used"] = reasons
     longest = judgement.steps[-1]
     if longest < learned.judged_steps[-1]:
-        notes.append(f"Judged {longest} ahead: {_of_more_than(longest)}.")
+        reason = _of_more_than(longest)
+        if longest == most_steps(learned, held_out, train):
+            reason = "no piece to judge on, or to learn from, is long enough for more"
+        notes.append(f"Judged {longest} ahead: {reason}.")
     if judgement.losses:
         lists["Where the model loses to what costs nothing"] = judgement.losses
     elif not _is_untold(judgement):
@@ -571,17 +576,19 @@ def _facts(
 
 
 def _outputs(learned: IdentifiedModel) -> list[str]:
-    """Returns for every output whether a GP learned its residual."""
-    names = learned.model.kinematics.output_names
-    with_gp = {names[i] for gp in learned.model.gps for i in gp.outputs}
+    """Returns what the model of every output is made of."""
+    model = learned.model
+    with_gp = {i for gp in model.gps for i in gp.outputs}
     lines = []
-    for name in names:
-        if name in with_gp:
-            lines.append(f"{name}: GP on the residual")
-        else:
-            lines.append(
-                f"{name}: nominal only; a GP did not make held-out rollouts better"
-            )
+    for i, name in enumerate(model.kinematics.output_names):
+        parts = []
+        if not is_still(model.nominal) and i not in model.without_nominal:
+            parts.append("nominal model")
+        if model.weights.size:
+            parts.append("linear term of past rows")
+        if i in with_gp:
+            parts.append("GP on the residual")
+        lines.append(f"{name}: {', '.join(parts) or 'zero'}")
     return lines
 
 
@@ -601,6 +608,8 @@ def _doubts(
     doubts += [f"{one}." for one in short_pieces(learned, judgement, held_out, train)]
     if learned.control is not None:
         doubts += learned.control.warnings
+    else:
+        doubts += [f"For control: {one}." for one in unflown_disturbance(learned.model)]
     if learned.model.correction is not None or learned.model.start_filter is not None:
         doubts.append(
             "Predictions begin at a state estimated from the rows before, and what the "

@@ -84,12 +84,39 @@ def compare(
 def independent_predictions(windows: Windows, steps: Sequence[int]) -> Array:
     """Counts the predictions (steps,) that do not overlap.
 
+    Those of different pieces do not: each piece has one at least.
+
     Args:
         windows: From whose starts is predicted.
         steps: After the starts.
     """
-    rows = len(windows) * windows.stride
-    return rows / np.maximum(steps, windows.stride)
+    return predictions_of_pieces(
+        windows.stride * _windows_of_pieces(windows), np.maximum(steps, windows.stride)
+    )
+
+
+def predictions_of_pieces(starts: Array, steps: Array) -> Array:
+    """Counts the predictions (steps,) of pieces that do not overlap.
+
+    Args:
+        starts: Rows from which is predicted, of each piece (pieces,), one at least.
+        steps: After the starts (steps,).
+    """
+    has_several = starts >= steps[:, None]  # (steps, pieces)
+    rows = np.where(has_several, starts, 0).sum(axis=1)
+    return rows / steps + (~has_several).sum(axis=1)
+
+
+def _windows_of_pieces(windows: Windows) -> Array:
+    """Counts the windows of each piece (pieces,).
+
+    Neighbours in a piece are a stride apart, those of two pieces all of a window.
+    """
+    apart = max(windows.past + windows.ahead + 1, windows.stride)
+    rows = np.diff(windows.times) / windows.time_step
+    begins_piece = (np.diff(windows.runs) != 0) | (rows > (apart + windows.stride) / 2)
+    begins = np.flatnonzero(np.r_[True, begins_piece])
+    return np.diff([*begins, len(windows)])
 
 
 def effective_number(values: Array, runs: np.ndarray) -> float:

@@ -101,7 +101,23 @@ def judge_for_control(
     faults += _hidden_motions(model, log, stride)
     significant = [effect for effect in effects if effect.input not in unknown]
     warnings = _disagreements(significant) + _unstable_loops(model, log, rivals)
+    warnings += unflown_disturbance(model)
     return ControlFitness(tuple(effects), tuple(faults), tuple(warnings), advice)
+
+
+def unflown_disturbance(model: LogModel) -> list[str]:
+    """Says that a model was judged with a disturbance that no controller has of it."""
+    rows = max(model.history)
+    if not rows:
+        return []
+    outputs = model.kinematics.output_names
+    names = [name for name, own in zip(outputs, model.history, strict=True) if own]
+    gain = 2 / (rows + 1)  # of the exponential mean that is as old as that of the rows
+    return [
+        f"predictions that were judged begin with the mean error of {', '.join(names)} "
+        f"over the last {rows} rows, which is no part of the model: a controller "
+        f"estimates it with disturbance_gain={gain:.1g}, and errs more without"
+    ]
 
 
 def _effects(

@@ -11,6 +11,7 @@ from gpmpc.logs._fitting import (
     NominalFit,
     distances_at_rest,
     fit_nominal,
+    judged_steps,
     mean_logarithm,
 )
 from gpmpc.logs._linear_terms import (
@@ -28,7 +29,7 @@ from gpmpc.models._parametric import AffineNominal
 _ROWS_OF_LAGS = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)  # time constants that are tried
 _FACTORS_OF_LAGS = (0.0, 0.5, 0.7, 1.4, 2.0)  # by which each is tried to change
 _WINDOWS = 150  # whose rollouts compare them
-_JUDGED = (1, 3, 10, 30, 50)  # steps of these
+_ALSO_JUDGED = (3, 30)  # steps of these
 
 
 def fit_from(
@@ -149,7 +150,7 @@ class _LagTrials:
         self._model = model
         self._log = log
         self._windows = log.windows(steps, past=max(model.past, PAST), most=_WINDOWS)
-        self._steps = sorted({min(step, steps) for step in _JUDGED})
+        self._steps = judged_steps(steps, finer=_ALSO_JUDGED)
         self._at_rest = distances_at_rest(self._windows, self._steps)
 
     def fit(self, time_constants: Array) -> LogModel:

@@ -32,6 +32,7 @@ from gpmpc.models._state_space import StateSpace
 from gpmpc.models._windows import Windows
 
 STEPS = 50  # of the rollouts that models are judged by
+_JUDGED = (1, 10, 50)  # steps after the starts of rollouts whose errors decide
 PAST = 20  # rows before them
 _WINDOWS = 300
 _EVALUATIONS = 15
@@ -65,6 +66,18 @@ class NominalFit:
         errors = self.standard_errors.tolist()
         rows = zip(names, values, errors, strict=False)
         return [row for row in rows if row[0]]
+
+
+def judged_steps(steps: int, finer: Sequence[int] = ()) -> tuple[int, ...]:
+    """Returns the steps whose errors decide, of rollouts of so many steps.
+
+    Args:
+        steps: Of the rollouts, which are among them.
+        finer: Others that count as well, where they are no more.
+    """
+    return tuple(
+        sorted({step for step in (*_JUDGED, *finer) if step < steps} | {steps})
+    )
 
 
 @explains_arguments

@@ -11,13 +11,13 @@ from gpmpc.logs._comparison import (
     compare,
     independent_predictions,
 )
+from gpmpc.logs._fitting import judged_steps
 from gpmpc.logs._folds import Fold
 from gpmpc.logs._log import Log
 from gpmpc.logs._ranges import state_widths
 from gpmpc.models._kinematics import Kinematics
 from gpmpc.models._log_model import LogModel
 
-_JUDGED = (1, 10, 50)  # steps whose errors decide
 _WINDOWS = 400  # that structures are compared on
 _EXACT_SHARE = 1e-4  # of a constant state's error: what is smaller counts as exact
 _ROUNDING = 1e-12  # of a state's range: likewise, where a constant state is exact
@@ -46,7 +46,7 @@ class HeldOutErrors:
         self._folds = folds
         self._steps = steps
         #: after the starts, whose errors count
-        self.judged_steps = tuple(sorted({min(step, steps) for step in _JUDGED}))
+        self.judged_steps = judged_steps(steps)
         #: of each fold
         self.windows = [
             fold.held_out.windows(steps, past=past_rows, most=_WINDOWS // len(folds))

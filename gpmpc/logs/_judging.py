@@ -7,6 +7,7 @@ mean variance that is claimed over the root mean squared error. Coverage alone i
 a width of one is honest.
 """
 
+import bisect
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,6 +27,7 @@ from gpmpc.logs._comparison import (
     compare,
     effective_number,
     independent_predictions,
+    predictions_of_pieces,
 )
 from gpmpc.logs._fitting import PAST
 from gpmpc.logs._learning import IdentifiedModel, fewest_rows
@@ -314,12 +316,15 @@ def most_told_steps(learned: IdentifiedModel, held_out: Log) -> int:
 
     So many that four predictions do not overlap; less than one for none.
     """
-    longest_past = _past_rows(learned)
-    rows = [end - begin - longest_past for run in held_out for begin, end in run.pieces]
-    steps = 0
-    while _starts(rows, steps + 1) >= FEWEST_PREDICTIONS * (steps + 1):
-        steps += 1
-    return steps
+    pieces = [end - begin for run in held_out for begin, end in run.pieces]
+    rows = np.array(pieces) - _past_rows(learned)
+
+    def too_few(steps: int) -> bool:
+        starts = rows[rows > steps] - steps
+        (count,) = predictions_of_pieces(starts, np.array([steps]))
+        return bool(count < FEWEST_PREDICTIONS)
+
+    return bisect.bisect_left(range(1, max(rows.max(), 1)), True, key=too_few)
 
 
 def short_pieces(
@@ -348,11 +353,6 @@ def short_pieces(
 def _past_rows(learned: IdentifiedModel) -> int:
     """Returns the rows before a start that a model and the baselines look back on."""
     return max(learned.model.past, PAST)
-
-
-def _starts(rows: Sequence[int], steps: int) -> int:
-    """Counts the starts of predictions in pieces of so many rows after the past."""
-    return sum(max(length - steps, 0) for length in rows)
 
 
 def check_learned(learned: IdentifiedModel, held_out: Log, train: Log) -> None:

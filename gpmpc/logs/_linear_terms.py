@@ -25,6 +25,7 @@ from gpmpc.exceptions import DataError
 from gpmpc.logs._fitting import (
     distances_at_rest,
     errors_at_rest,
+    judged_steps,
     mean_logarithm,
 )
 from gpmpc.logs._log import Log, LogRun
@@ -36,7 +37,6 @@ PENALTIES = (1e-9, 1e-5, 1e-3, 1e-2, 0.1, 0.3, 1.0)  # of standardised columns, 
 _FIRST_PENALTY = 1e-2
 _ROWS = 10_000  # to which a term is fitted
 _WINDOWS = 100  # of a half, whose rollouts choose
-_JUDGED = (1, 10, 50)  # steps of them
 _BLOCKS = 8  # of a log of few runs, half of which are left out
 _FEW_RUNS = 4
 _MOST_REFINED = 250  # weights of a term that is refined
@@ -233,7 +233,7 @@ class _Trial:
         """
         steps = max(min(steps, held_out.longest_piece - model.past - 1), 1)
         windows = held_out.windows(steps, past=model.past, most=_WINDOWS)
-        judged = tuple(sorted({min(step, steps) for step in _JUDGED}))
+        judged = judged_steps(steps)
         at_rest = distances_at_rest(windows, judged)
         return cls(model, _moments(model, log), windows, judged, at_rest)
 

@@ -145,6 +145,8 @@ def _smooth_run(
         noise: Of measurements and movement.
         time_step: [s].
     """
+    if len(run) < 2:  # no movement tells of a single row
+        return run
     space = model.kinematics.space
     lengths = difference_steps(space.difference(about.states[:-1], space.origin))
     states = np.empty_like(run.states)

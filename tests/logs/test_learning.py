@@ -11,6 +11,7 @@ import pandas
 import pytest
 
 from gpmpc.cli._learn import _doubts, _reasons_against, _save_model
+from gpmpc.cli._learn import _outputs as outputs_in_words
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.logs import (
     Log,
@@ -298,6 +299,10 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
         doubts = _doubts(replace(learned, noise=noise), judgement, pieces, train)
         assert any("A controller's tube" in one for one in doubts) == (correlated > 0)
     assert any("knows the inputs to come" in one for one in doubts)
+    terms = replace(learned.model, weights=np.ones((2, 3)), without_nominal=(0,))
+    first, last = outputs_in_words(replace(learned, model=terms))
+    assert first.partition(": ")[2].split(", ")[0] == "linear term of past rows"
+    assert last.partition(": ")[2].startswith("nominal model, linear term of past")
     ranges = learned.ranges.copy()
     ranges[:, 1] = 2.0
     still = replace(learned, ranges=ranges)

@@ -3,6 +3,7 @@
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,11 +14,16 @@ from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gp import train
 from gpmpc.logs import Judgement, Log, LogMapping, fit_nominal, judge, learn
 from gpmpc.logs._baselines import baseline_errors
-from gpmpc.logs._comparison import compare, effective_number
+from gpmpc.logs._comparison import (
+    compare,
+    effective_number,
+    independent_predictions,
+)
 from gpmpc.logs._control_fitness import _linearize, judge_for_control
 from gpmpc.logs._fitting import _standard_errors, fit_least_squares
 from gpmpc.logs._folds import split_folds
-from gpmpc.logs._judging import _coverage_intervals
+from gpmpc.logs._held_out_errors import HeldOutErrors
+from gpmpc.logs._judging import _coverage_intervals, most_told_steps
 from gpmpc.logs._learning import _plan_folds
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._noise import _nonnegative_solution, fit_noise, learning_gains
@@ -281,8 +287,10 @@ def test_smoothing_takes_noise_away_and_leaves_clean_rows(monkeypatch):
     kinematics = Increments(TWO.space)
     assert smooth(log_of([clean], [inputs], step=0.02), kinematics, 0) is None
     noisy = clean + rng.normal(0, [0.02, 0.05], clean.shape)
-    smoothed = smooth(log_of([noisy], [inputs], step=0.02), kinematics, 0)
+    with_stub = log_of([noisy, noisy[:1]], [inputs, inputs[:1]], step=0.02)
+    smoothed = smooth(with_stub, kinematics, 0)
     assert smoothed is not None
+    np.testing.assert_array_equal(smoothed.runs[1].states, noisy[:1])
     errors = np.sqrt(np.square(smoothed.runs[0].states - clean).mean(axis=0))
     assert (errors < 0.4 * np.array([0.02, 0.05])).all()
     # Of long runs, a block at a time makes equations.
@@ -523,6 +531,29 @@ def test_intervals_of_a_comparison_hold():
     assert none.ratio == again.ratio
 
 
+@pytest.mark.parametrize("are_pieces", [False, True])
+def test_predictions_of_different_pieces_are_independent(are_pieces):
+    log = log_of(np.zeros((60, 71, 2)), np.zeros((60, 71, 1)))
+    if are_pieces:
+        log = log_of(np.zeros((1, 60 * 71, 2)), np.zeros((1, 60 * 71, 1)))
+        (run,) = log.runs
+        log = replace(log, runs=(replace(run, begins=tuple(range(0, 60 * 71, 71))),))
+    for windows, steps in log.windows_by_step((1, 50), 20, most=1000):
+        independent = independent_predictions(windows, steps)
+        np.testing.assert_array_equal(independent, [60] * len(steps))
+    learned = SimpleNamespace(model=SimpleNamespace(past=20))
+    assert most_told_steps(learned, log) == 50
+    one_run = log_of(np.zeros((1, 71, 2)), np.zeros((1, 71, 1)))
+    assert most_told_steps(learned, one_run) == 51 // 5
+
+
+def test_steps_that_were_asked_for_decide():
+    log = log_of(np.ones((4, 200, 2)), np.zeros((4, 200, 1)))
+    folds = split_folds(log, 24, 120).parts
+    errors = HeldOutErrors(log, folds, Increments(TWO.space), 24, 120)
+    assert errors.judged_steps == (1, 10, 50, 120)
+
+
 def test_windows_that_overlap_are_one_error():
     """Of ten windows that share their rows a mean is known no better than of one."""
     signs = np.tile([1.0, -1.0], 8)
@@ -670,19 +701,21 @@ def test_a_model_that_no_controller_should_use_is_named():
     def rates(x, u):
         return [x[1], -x[0] - 0.5 * x[1] + 2 * u[0]]
 
-    def fitness(inputs, states):
+    def fitness(inputs, states, history=(0, 0)):
         log = log_of([states], [inputs])
-        model = LogModel(
-            Increments(log.space), AffineNominal(Increments(log.space)), THETA, (0, 0)
-        )
+        kinematics = Increments(log.space)
+        model = LogModel(kinematics, AffineNominal(kinematics), THETA, history)
         return judge_for_control(model, log, {})
 
     inputs = held_inputs(rng, 600, 1.0)
     states = simulate(rates, [0.1, 0], inputs)
     good = fitness(inputs, states)
     assert not good.faults
-    assert not good.warnings
     assert not good.advice
+    assert not good.warnings
+    (warning,) = fitness(inputs, states, history=(0, 20)).warnings
+    assert "mean error of d_T over the last 20 rows" in warning
+    assert "disturbance_gain=0.1" in warning
     assert (good.effects[0].output, round(good.effects[0].gain, 3)) == ("d_T", 2.0)
     constant = fitness(np.full((600, 1), 0.3), simulate(rates, [1, 0], [[0.3]] * 600))
     assert "does not move" in constant.faults[0]
