@@ -32,7 +32,9 @@ class Stamps(NamedTuple):
 
     rows: np.ndarray  # (K,) of the table, those that are used
     time: Array  # (K,) [s]
-    after_reversal: np.ndarray  # (K,) whether rows with earlier stamps stood before
+    #: (K,) whether time does not go on from the row before: it ran backwards, the
+    #: clock began anew, or nobody knows
+    starts_piece: np.ndarray
     repeated: int
     backwards: int  # rows that are left out because a later stamp stood before
     disordered: int = 0  # rows that stood behind later ones, and are sorted
@@ -98,7 +100,7 @@ def _sorted_rows(stamps: Array, disordered: int) -> Stamps:
     return Stamps(
         rows=order[is_new],
         time=stamps[order][is_new],
-        after_reversal=np.zeros(int(is_new.sum()), dtype=bool),
+        starts_piece=np.zeros(int(is_new.sum()), dtype=bool),
         repeated=int((~is_new).sum()),
         backwards=0,
         disordered=disordered,
@@ -116,7 +118,7 @@ def _rising_rows(stamps: Array) -> Stamps:
     return Stamps(
         rows=rows,
         time=stamps[rows],
-        after_reversal=reversed_before,
+        starts_piece=reversed_before,
         repeated=int(repeated.sum()),
         backwards=int(backwards.sum()),
     )
@@ -163,13 +165,13 @@ def _in_turn(parts: Sequence[Stamps], max_gap: float | None) -> Stamps:
             pause = 2 * max(JUMP, JUMP_STEPS * usual_step, max_gap or 0.0)
         rows.append(begin + part.rows)
         times.append(part.time - part.time[0] + end + pause)
-        breaks.append(np.r_[bool(pause), part.after_reversal[1:]])
+        breaks.append(np.r_[bool(pause), part.starts_piece[1:]])
         begin += len(part.rows) + part.repeated + part.backwards
         end = times[-1][-1]
     return Stamps(
         rows=np.concatenate(rows),
         time=np.concatenate(times),
-        after_reversal=np.concatenate(breaks),
+        starts_piece=np.concatenate(breaks),
         repeated=sum(part.repeated for part in parts),
         backwards=sum(part.backwards for part in parts),
         restarts=len(parts) - 1,

@@ -22,8 +22,10 @@ from gpmpc.logs._file import (
     TEXT_BYTES,
     LogFile,
     ReadOptions,
+    blocks_of,
     check_column_count,
     run_name,
+    with_blocks,
 )
 from gpmpc.logs._findings import Finding
 from gpmpc.logs._list_cells import unpack_lists
@@ -56,7 +58,10 @@ def read_csv(path: Path, options: ReadOptions) -> LogFile:
     )
     table = unpack_lists(path, table, budget)
     findings = (*_findings(path, csv, swallowed), *_unsure_marks(path, unsure))
-    return LogFile({"": with_units(table, units)}, findings)
+    table = with_units(table, units)
+    if not swallowed:  # lines are rows
+        table = with_blocks(table, blocks_of(csv.rows_behind_blank, len(table)))
+    return LogFile({"": table}, findings)
 
 
 def _unsure_marks(path: Path, columns: Sequence[str]) -> Iterator[Finding]:
@@ -102,12 +107,17 @@ def _findings(path: Path, csv: CsvText, swallowed: int) -> Iterator[Finding]:
     if not csv.names:
         text = "no line names the columns: they are called by their numbers, 1, 2, ..."
         yield Finding("no names", run, csv.columns, text)
-    if csv.blank:
+    blank = len(csv.rows_behind_blank)
+    if blank:
+        is_parted = not swallowed and blocks_of(csv.rows_behind_blank, csv.stream.rows)
+        effect = "rows behind them are pieces of their own"
+        if not is_parted:
+            effect = "they are no step of the time"
         text = (
-            f"{csv.blank} blank lines between rows: left out, and no step of the time "
-            "where rows are counted"
+            f"{blank} blank lines between rows: left out; where rows are counted, "
+            f"{effect}"
         )
-        yield Finding("blank lines", run, csv.blank, text)
+        yield Finding("blank lines", run, blank, text)
     if swallowed > 0:
         text = (
             f"{swallowed} lines stand inside texts in quotes, and are no rows: is a "

@@ -57,12 +57,18 @@ class CsvText(NamedTuple):
     #: mark means in them is not sure (``_csv_numbers``)
     doubtful: list[int]
     skipped: int  #: lines before the rows: neither names, nor units, nor comments
-    head: int  #: lines before the rows, comments and blank ones left out
+    lines_before_rows: int  #: comments and blank ones left out
 
     @property
-    def blank(self) -> int:
-        """Blank lines between rows, known where all is read."""
-        return sum(row > self.head for row in self.stream.lines.behind_blank)
+    def rows_behind_blank(self) -> list[int]:
+        """The row behind each blank line between rows, known where all is read.
+
+        They are counted from 0 on; a row comes once for each blank line before it.
+        """
+        rows = (
+            line - self.lines_before_rows for line in self.stream.lines.behind_blank
+        )
+        return [row for row in rows if row > 0]
 
     @property
     def is_cut(self) -> bool:
@@ -118,7 +124,7 @@ def open_csv(where: str, file: io.BufferedReader) -> CsvText:
         decimal=decimal,
         doubtful=doubtful_columns(rows, decimal),
         skipped=header.skipped,
-        head=first,
+        lines_before_rows=first,
     )
 
 
@@ -129,7 +135,8 @@ class _Lines(Iterator[str]):
         self.encoding = _find_encoding(file.peek(_START)[:_START])
         self.comments: list[str] = []  # before the first line, the last ones
         self.is_cut = False  # the last line has no end
-        #: for each blank line, how many others were read up to the one behind it
+        #: for each blank line, the number of the line behind it, from 0 on, among those
+        #: that are neither blank nor comments
         self.behind_blank = array("q")
         self.where = where
         self.count = 0  # of the lines that were read

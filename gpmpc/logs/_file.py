@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+import numpy as np
 import pandas as pd
 
 from gpmpc.exceptions import DataError
@@ -21,6 +22,9 @@ LIST_NAMES = "(names)"
 NUMBER_BYTES = 32  # of a number in a table, and of its copies on the way there
 TEXT_BYTES = 64  # of a short text in a table, or of another Python object
 MOST_COLUMNS = 4096  # of a table; with many more, pandas takes seconds for any
+
+FEWEST_IN_BLOCK = 5  # rows on average: blank lines part blocks of as many
+_BLOCKS_KEY = "blocks"  # in the ``attrs`` of a table
 
 Tables = dict[str, pd.DataFrame]  # by topic; "" where a file has a single table
 
@@ -45,6 +49,32 @@ class ReadOptions:
     topics: tuple[str, ...] = ()  # that are read; none for all
     partial: bool = False  # take what is whole of an unfinished or damaged file
     stamp: str = ""  # times of a bag's messages: "header", "log", or "" (see ``_bag``)
+
+
+def blocks_of(rows_behind_blank: Sequence[int], rows: int) -> tuple[int, ...]:
+    """Returns the rows with which blocks of rows begin behind blank lines.
+
+    None where blank lines stand between most rows, as a program's ends of lines.
+    """
+    begins = tuple(sorted(set(rows_behind_blank)))
+    return begins if FEWEST_IN_BLOCK * len(begins) <= rows else ()
+
+
+def with_blocks(table: pd.DataFrame, begins: tuple[int, ...]) -> pd.DataFrame:
+    """Returns a table that knows with which of its rows blocks begin.
+
+    Rows are numbered by the table's index, as in the file.
+    """
+    table = table.copy(deep=False)
+    table.attrs = {**table.attrs, _BLOCKS_KEY: begins}
+    return table
+
+
+def begins_block(table: pd.DataFrame) -> np.ndarray:
+    """Tells which rows (K,) of a run begin a block of their file."""
+    begins = table.attrs.get(_BLOCKS_KEY, ())
+    blocks = np.searchsorted(begins, table.index.to_numpy(), side="right")
+    return np.diff(blocks, prepend=blocks[:1]) > 0
 
 
 class LogFile(NamedTuple):

@@ -138,7 +138,7 @@ def cut_pieces(stamps: Stamps, max_gap: float | None) -> Array:
 
 def _begins_piece(stamps: Stamps, max_gap: float | None) -> np.ndarray:
     """Tells before which rows (K,) time ran backwards, or jumped."""
-    begins = stamps.after_reversal.copy()
+    begins = stamps.starts_piece.copy()
     begins[find_jumps(stamps.time, max_gap) + 1] = True
     return begins
 

@@ -25,6 +25,7 @@ TIMES = (
     *("zeit", "zeitstempel"),
 )
 _SAMPLE = 50  # rows in which texts are looked at: are they dates?
+_SAME_SPAN = 0.02  # of the time that a log took: a clock in its messages goes as far
 LATEST_UNSTATED = 1e11  # [s] since 1970, in the year 5138
 LONGEST_UNSTATED = 3600.0  # [s] between rows whose stamps nobody gave a unit
 EARLIEST_DATE = 1e9  # [s] since 1970: stamps from there on are rather in s
@@ -164,6 +165,31 @@ def doubt_of_unit(table: pd.DataFrame, column: str, unit: str, times: Array) -> 
     )
 
 
+def unit_of_clock(table: pd.DataFrame, column: str) -> str:
+    """Returns the unit in which a column of whole numbers goes on as stamps do.
+
+    Args:
+        table: Of a topic, with the stamps of its messages.
+        column: That may be a clock in the messages.
+
+    Returns:
+        One of ``TIME_UNITS``; empty where the column is none, or no such clock.
+    """
+    if STAMP not in table or column not in table:
+        return ""
+    clock = pd.to_numeric(table[column], errors="coerce").to_numpy(dtype=float)
+    stamps = table[STAMP].to_numpy(dtype=float)
+    is_clock = np.isfinite(clock).all() and (clock % 1 == 0).all()
+    if len(clock) < 2 or not is_clock or (np.diff(clock) < 0).any():
+        return ""
+    elapsed = np.ptp(clock)
+    logged = np.ptp(stamps[np.isfinite(stamps)])
+    for unit, factor in TIME_UNITS.items():
+        if abs(elapsed * factor - logged) < _SAME_SPAN * logged:
+            return unit
+    return ""
+
+
 def read_dates(table: pd.DataFrame, column: str) -> Array | None:
     """Reads dates (K,) [s] since 1970 that are texts, such as 2024-05-01 12:00:00.
 
@@ -194,6 +220,8 @@ def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | N
         DataError: The column that ``time.step`` names does not hold one positive
             number.
     """
+    if not counts_rows(table, mapping):
+        return None
     step = mapping.time_step
     if isinstance(step, str):
         step = _only_number(where, table, step)
@@ -202,9 +230,16 @@ def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | N
         if isinstance(mapping.time_step, str):
             unit = unit or time_unit(where, table, mapping.time_step)
         return _steps_from_first(table) * step * TIME_UNITS[unit or "s"]
-    if mapping.rate and not unread_times(table, mapping):
-        return _steps_from_first(table) / mapping.rate
-    return None
+    return _steps_from_first(table) / (mapping.rate or 1.0)
+
+
+def counts_rows(table: pd.DataFrame, mapping: LogMapping) -> bool:
+    """Tells whether rows have no times, but a step that the mapping says."""
+    if mapping.time:
+        return False
+    if mapping.time_step is not None:
+        return True
+    return mapping.rate is not None and not unread_times(table, mapping)
 
 
 def unread_times(table: pd.DataFrame, mapping: LogMapping) -> str:

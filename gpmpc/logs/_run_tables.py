@@ -18,7 +18,7 @@ from gpmpc.logs._clocks import (
 )
 from gpmpc.logs._decimation import changes_between_rows, held_means
 from gpmpc.logs._equal_stamps import TimedRows, merge_rows
-from gpmpc.logs._file import STAMP, Tables, names_of_list
+from gpmpc.logs._file import STAMP, Tables, begins_block, names_of_list
 from gpmpc.logs._findings import RunFindings
 from gpmpc.logs._mapping import LogMapping, Signal
 from gpmpc.logs._resampling import (
@@ -31,9 +31,11 @@ from gpmpc.logs._resampling import (
     resample,
 )
 from gpmpc.logs._row_times import (
+    counts_rows,
     doubt_of_unit,
     read_times,
     row_times,
+    unit_of_clock,
     unit_text,
     unread_times,
 )
@@ -140,6 +142,9 @@ def _read_topic(
         times, where, hint, may_restart=not topic, max_gap=mapping.max_gap
     )
     ordered = table.iloc[stamps.rows]
+    if counts_rows(table, mapping):
+        starts_piece = stamps.starts_piece | begins_block(ordered)
+        stamps = stamps._replace(starts_piece=starts_piece)
     measured = ordered
     if any((signal.held or mapping.held) != "use" for signal in signals):
         measured = nan_zero_dropouts(where, ordered, signals, findings)
@@ -227,6 +232,8 @@ def _read_time(
                 "needs the column that it is of: the stamps of messages are in s; got "
                 f"{mapping.time_unit!r} alone",
             )
+        if topic and not mapping.stamp:
+            _note_clock_of_messages(topic, table, findings)
     times = read_times(where, table, column, mapping.time_unit)
     if mapping.time or not topic:  # the stamps of messages are in s
         _note_unit_of_time(table, column, mapping.time_unit, times, findings)
@@ -243,6 +250,23 @@ def _note_counted_rows(rows: int, mapping: LogMapping, findings: RunFindings) ->
         "one)"
     )
     findings.add("no times", rows, text)
+
+
+def _note_clock_of_messages(
+    topic: str, table: pd.DataFrame, findings: RunFindings
+) -> None:
+    """Notes messages with times of the log that carry a clock without a header.
+
+    So do PX4's topics in bags: they came to the log later, and not evenly.
+    """
+    unit = unit_of_clock(table, "timestamp")
+    if unit:
+        text = (
+            f"{topic} has the times of the log, and its column timestamp goes on as a "
+            f"clock in {unit}: time: {{column: timestamp, unit: {unit}}} takes it, "
+            "where all topics have it"
+        )
+        findings.add("times of the log", len(table), text)
 
 
 def _note_unit_of_time(
@@ -298,7 +322,7 @@ def _note_stamps(
     )
     findings.add("clock began anew", stamps.restarts, text)
     jumps = find_jumps(stamps.time, mapping.max_gap)
-    jumps = jumps[~stamps.after_reversal[jumps + 1]]
+    jumps = jumps[~stamps.starts_piece[jumps + 1]]
     if len(jumps):
         longest = float(np.diff(stamps.time)[jumps].max())
         text = (
@@ -445,7 +469,7 @@ def _following_rows(stamps: Stamps) -> np.ndarray:
     if not len(steps):
         return np.zeros(len(stamps.time), dtype=bool)
     is_usual = steps <= USUAL_GAP * np.median(steps)
-    return np.r_[False, is_usual] & ~stamps.after_reversal
+    return np.r_[False, is_usual] & ~stamps.starts_piece
 
 
 def _rows_outside_of(

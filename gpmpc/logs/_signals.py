@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from gpmpc._angles import wrap
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
+from gpmpc.gp._wrapped import wrapped_columns
 from gpmpc.logs._columns import check_column
 from gpmpc.logs._dropouts import sentinels, zero_dropouts
 from gpmpc.logs._findings import RunFindings
@@ -129,6 +130,7 @@ def read_signal(
     kept_values = np.where(is_kept[:, None], values, np.nan)
     _check_angles(where, kept_values, signal, findings, follows)
     _note_turns(values, signal, findings, follows)
+    _note_undeclared_angles(values, signal, findings, follows)
     if signal.kind == "euler":
         return _euler_to_quaternions(values, present=~absent)
     return values
@@ -193,6 +195,32 @@ def _note_turns(
         "take it as a plain number; log its sine and cosine, or count its turns"
     )
     findings.add("turns", jumps.sum(), text)
+
+
+def _note_undeclared_angles(
+    values: Array, signal: Signal, findings: RunFindings, follows: np.ndarray
+) -> None:
+    """Notes columns that jump by whole turns, and that no ``kind`` calls angles.
+
+    Between the rows of a rate they pass through all angles, where the sensor passed
+    from one end of its range to the other.
+    """
+    may_be_angles = signal.group.unit in ("rad", "")
+    if signal.kind != "vector" or not may_be_angles:
+        return
+    behind = np.flatnonzero(follows)
+    present = np.isfinite(values[behind]) & np.isfinite(values[behind - 1])
+    for column, name in enumerate(signal.columns):
+        rows = behind[present[:, column]]
+        after = values[rows, column][:, None]
+        before = values[rows - 1, column][:, None]
+        for wrapped in wrapped_columns(before, after):
+            text = (
+                f"{name} jumps by a whole turn ({wrapped.turn}) {wrapped.rows} times, "
+                "and is taken as a plain number, also by a rate: is it an angle? "
+                "(kind: angle, unit: rad or deg)"
+            )
+            findings.add("turns", wrapped.rows, text)
 
 
 def _count_jumps(changes: Array) -> int:

@@ -193,6 +193,22 @@ def test_lines_that_are_no_rows_are_counted(tmp_path, text, kind, count):
     assert found == ([(kind, count)] if kind else [])
 
 
+@pytest.mark.parametrize("time", [{"time": {"step": 0.01}}, {"rate": 100}])
+@pytest.mark.parametrize("every", [100, 1])
+def test_rows_behind_blank_lines_are_pieces_where_rows_are_counted(
+    tmp_path, time, every
+):
+    lines = TABLE[["x", "u"]].to_csv(index=False, header=False).splitlines(True)
+    blocks = ["".join(lines[k : k + every]) for k in range(0, len(lines), every)]
+    (tmp_path / "log.csv").write_text("x,u\n" + "\n".join(blocks))
+    signals = {key: MAPPING[key] for key in ("states", "inputs")}
+    log = read_log(tmp_path / "log.csv", {**signals, **time})
+    assert log.runs[0].begins == ((0, 100, 200) if every > 1 else (0,))
+    assert len(log) == 300
+    (finding,) = [f for f in log.findings if f.kind == "blank lines"]
+    assert ("are pieces of their own" in finding.text) == (every > 1)
+
+
 def test_a_column_may_be_called_by_a_hexadecimal_number(tmp_path):
     text = "time: t\nstates: {x: [0x1A]}\ninputs: {u: [010, 0b1, 10]}\nrate: 10"
     (tmp_path / "map.yaml").write_text(text)

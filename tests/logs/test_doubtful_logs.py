@@ -376,6 +376,19 @@ def test_an_angle_that_is_no_state_and_jumps_by_a_turn_is_noted(tmp_path, role):
     assert text.startswith("heading jumps by a turn 8 times, and is no state: models")
 
 
+@pytest.mark.parametrize("rate", [None, 30])
+@pytest.mark.parametrize("unit", ["", "deg"])
+@pytest.mark.parametrize("role", ["states", "context"])
+def test_an_angle_that_nobody_declared_is_noted(tmp_path, role, unit, rate):
+    table = table_of()
+    table["yaw"] = np.mod(10.0 * np.arange(300) + 180, 360) - 180
+    signals = {**MAPPING.get(role, {}), "heading": {"columns": ["yaw"], "unit": unit}}
+    mapping = {**MAPPING, role: signals, "rate": rate}
+    turn = "2 pi" if unit else "360"
+    (text,) = texts(read_log(written(tmp_path, table), mapping), "turns")
+    assert text.startswith(f"yaw jumps by a whole turn ({turn}) 8 times, and is taken")
+
+
 def test_rows_that_two_files_share_are_noted(tmp_path):
     table = table_of(600)
     files = [

@@ -194,6 +194,22 @@ def test_few_rows_of_a_clock_that_was_set_back_are_left_out(tmp_path):
     assert all(9 <= count <= 11 for count in backwards)
 
 
+@pytest.mark.parametrize(("unit", "factor"), [("us", 1e6), ("ns", 1e9)])
+def test_a_clock_in_messages_without_a_header_is_named(tmp_path, unit, factor):
+    topics = strange.pendulum_topics(ROWS, header=False)
+    for name, topic in topics.items():
+        clock = np.round(factor * (5 + STEP * np.arange(ROWS)))
+        columns = {**topic.columns, "timestamp": clock}
+        topics[name] = topic._replace(columns=columns)
+    path = strange.write_bag(tmp_path / "arm.mcap", topics)
+    log = read_log(path, BAG_MAPPING)
+    assert kinds(log) == {"times of the log": ROWS}
+    assert f"time: {{column: timestamp, unit: {unit}}} takes it" in texts(log)
+    time = {"column": "timestamp", "unit": unit}
+    log = read_log(path, {**BAG_MAPPING, "time": time})
+    assert (log.runs[0].time[0], kinds(log)) == (5.0, {})
+
+
 def test_a_simulated_clock_that_begins_at_zero_is_a_clock(tmp_path):
     topics = strange.pendulum_topics(ROWS)
     for name, topic in topics.items():
