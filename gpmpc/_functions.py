@@ -62,7 +62,10 @@ _DECISION = (
 
 
 def call(key: str, function: Callable[..., Any], *arguments: Tensor) -> Any:
-    """Calls a function of tensors that a user wrote.
+    """Calls a function of tensors that a user wrote; checks that torch follows it.
+
+    Of a value that torch follows in part the rest is not seen: ``check_slopes`` of
+    ``gpmpc.models._nominal`` compares with differences, where a function enters.
 
     Args:
         key: What the function is, for the message.

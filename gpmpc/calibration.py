@@ -246,6 +246,7 @@ def calibrate(
     _check(model, recordings, horizon, levels, names)
     turning = angles_of(model) if angles is None else list(angles)
     noise = _assumed_noise(model, propagator, measurement_noise)
+    # of each number of steps, less one, those of the chunks of all recordings
     predictions: list[list[_Predictions]] = [[] for _ in range(horizon)]
     with torch.no_grad():
         for recording in recordings:
@@ -288,7 +289,7 @@ class _Noise(NamedTuple):
 
     moves_state: bool  #: whether the propagator adds the process noise at every step
     start: Tensor  #: covariance of the states where predictions begin (n, n)
-    last: Tensor  #: variances added to what is compared (n,)
+    of_compared: Tensor  #: variances added to predictions of any step (n,)
 
 
 class _Predictions(NamedTuple):
@@ -314,10 +315,12 @@ def _assumed_noise(
         sensors = torch.tensor(
             deviations, dtype=model.dtype, device=model.device
         ).square()
-    last = sensors
+    of_compared = sensors
     if not moves_state and measurement_noise is None:
-        last = model.noise_covariance.diagonal()[:n]
-    return _Noise(moves_state=moves_state, start=torch.diag(sensors), last=last)
+        of_compared = model.noise_covariance.diagonal()[:n]
+    return _Noise(
+        moves_state=moves_state, start=torch.diag(sensors), of_compared=of_compared
+    )
 
 
 def _predict_recording(
@@ -353,7 +356,7 @@ def _predict_recording(
             control = inputs[first + k : last + k]
             belief = propagator.propagate(model, belief, control).belief
             mean = belief.mean[:, :n].double().cpu()
-            variance = (belief.variance[:, :n] + noise.last).double().cpu()
+            variance = (belief.variance[:, :n] + noise.of_compared).double().cpu()
             observed = recording.states[first + k + 1 : last + k + 1].clone()
             observed[:, angles] -= whole_turns((observed - mean)[:, angles])
             yield k, _Predictions(mean=mean, variance=variance, observed=observed)
@@ -383,7 +386,7 @@ def _columns(predictions: _Predictions) -> list[_Predictions]:
 def _table(
     columns: list[list[_Predictions]], measure: Callable[[_Predictions], Any]
 ) -> Tensor:
-    """Measures the predictions of every step and state (H, n, ...)."""
+    """Measures the predictions columns[step][state] of each (H, n, ...)."""
     values = [[measure(column) for column in step] for step in columns]
     return torch.tensor(values, dtype=torch.float64)
 

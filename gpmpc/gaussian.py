@@ -57,10 +57,13 @@ def check_covariance(key: str, value: Tensor) -> None:
 
 
 def constant_arrays(*tensors: Tensor) -> list[NDArray[Any]] | None:
-    """Returns tensors as arrays, in microseconds: control steps call it repeatedly.
+    """Returns tensors that are constants in host memory as arrays.
 
-    Returns None where a tensor is on another device, or where autograd or a function
-    transform follows it.
+    It takes microseconds: control steps call it repeatedly.
+
+    Returns:
+        None where a tensor is on another device, or where autograd or a function
+        transform follows it: the caller then computes by torch.
     """
     arrays = []
     try:

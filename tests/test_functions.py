@@ -2,6 +2,7 @@
 
 import cmath
 import math
+from dataclasses import replace
 from math import cos
 
 import numpy as np
@@ -18,6 +19,7 @@ from gpmpc.mpc import GPMPC, Inequality, LeastSquares, Problem, Reference, Track
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.propagation import Linearization
 from gpmpc.systems import System, step, step_many
+from tests.gp.small_models import posterior
 
 F = torch.float64
 MODEL = KnownModel(Affine.identity(2, 1), 2, 1)
@@ -186,6 +188,22 @@ def test_a_function_that_loses_a_part_of_its_derivative_is_refused(lost):
     with pytest.raises(SettingError, match=lost_in_part):
         KalmanFilter.extended(MODEL, measurement)
     KalmanFilter.unscented(MODEL, measurement)  # sigma points ask for values alone
+    gp = posterior(n=1, m=2, predicts="value")
+    good = ResidualModel(
+        nominal=lambda x, u: x + u,
+        residual=gp,
+        B=lambda x: torch.cos(x)[..., None],
+        states=[1],
+        inputs=[0, 1],
+        input_dim=2,
+        noise=torch.eye(2, dtype=F),
+    )
+    for parts, key in (
+        ({"nominal": lambda x, u: lost(x) + u}, "nominal"),
+        ({"B": lambda x: lost(x)[..., None]}, "B"),
+    ):
+        with pytest.raises(SettingError, match=f"{key}: must be followed .* as a who"):
+            replace(good, **parts)
 
 
 @pytest.mark.parametrize(

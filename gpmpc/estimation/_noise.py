@@ -207,7 +207,8 @@ class Residuals(NamedTuple):
     """Errors of a model's outputs, each predicted without its block of rows."""
 
     errors: Tensor  #: (N, k)
-    latent: Tensor  #: variances of the latent functions (N, k)
+    #: variances of the latent functions without the block (N, k)
+    latent: Tensor
 
 
 def residuals(model: Any, transitions: Transitions, block: int) -> Residuals:
@@ -319,6 +320,8 @@ def _leave_out_blocks(
         change = _change_without_points(trained, between, points)
         effect = trained.effect[between]
         errors[between] += (effect @ change.errors[..., None])[..., 0]
+        # Of these the variance by all points is known, of the block's own the one
+        # without their points.
         latent[between] += (effect.square() @ change.latent[..., None])[..., 0]
         own_errors = trained.errors_of_points[points]
         left_out_errors = torch.zeros_like(own_errors)
@@ -515,7 +518,7 @@ def estimate_varying_noise(
     squares = errors.square().clamp_min(1e-300)
     features = noise_features(model)(transitions.states, transitions.inputs)
     states, inputs = (part.cpu() for part in features)
-    learner = _VarianceLearner.start(states, inputs, squares, latent, seed)
+    learner = _VarianceLearner.from_log_squares(states, inputs, squares, latent, seed)
     fold = torch.arange(len(squares)) // block % FOLDS
     gains = torch.zeros_like(errors)
     for part in range(FOLDS):
@@ -584,10 +587,11 @@ class _VarianceLearner(NamedTuple):
     latent: Tensor  #: variances of the latent functions (N, k)
     kernel: Hyperparameters  #: of g
     inducing: Tensor  #: inducing points of g (M, d)
-    first: GPPosterior  #: g from the regression on log e^2, where iterations begin
+    #: g from the regression on log e^2, where iterations begin
+    initial_gp: GPPosterior
 
     @classmethod
-    def start(
+    def from_log_squares(
         cls,
         states: Tensor,
         inputs: Tensor,
@@ -624,7 +628,7 @@ class _VarianceLearner(NamedTuple):
             latent=latent,
             kernel=kernel,
             inducing=features[informative_points(features, kernel, POINTS)],
-            first=training.posterior,
+            initial_gp=training.posterior,
         )
 
     def learn(self, rows: Tensor) -> _LogVariance:
@@ -635,7 +639,7 @@ class _VarianceLearner(NamedTuple):
         constant = _constant_log_variance(squares, latent)
         kernel = self.kernel._replace(noise_variance=torch.full_like(constant, 2.0))
         states, inputs = x.split([x.shape[1] - self.input_dim, self.input_dim], dim=1)
-        g = self.first
+        g = self.initial_gp
         for _ in range(ITERATIONS):
             current = g.predict(states, inputs).mean
             about_zero = sparse_posterior(

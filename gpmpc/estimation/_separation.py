@@ -43,7 +43,10 @@ class SeparatedNoise:
     #: the same predictions, with the noise of the process alone; ``observation_noise``
     #: of its GPs, or of a ``ResidualModel`` with its own noise, is still all of it
     model: DynamicsModel
-    process: Tensor  #: variances of what moves the state in a step (n,)
+    #: variances of what moves the state in a step (n,). ``noise_covariance`` of a
+    #: ``ResidualModel`` may be larger: each of its outputs keeps as much of its noise
+    #: as the state with the most left that it acts on
+    process: Tensor
     #: variances of the sensors (n,); zero where none can be told from zero
     measurement: Tensor
 

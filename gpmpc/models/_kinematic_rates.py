@@ -146,6 +146,7 @@ def _unlearned_noise(
     """
     missed = torch.zeros_like(states)
     for rate, position, c, remainder, remainder_is_learned in integrals:
+        # What a rate misses, of a chain of rates, moves its position too.
         missed[:, position] = c * h * missed[:, rate]
         if not remainder_is_learned:
             missed[:, position] += remainder

@@ -74,7 +74,7 @@ class LogLinearizer:
         )
 
     def _next_slopes(
-        self, x: Array, local: "_Point", outputs: "_LocalOutputs"
+        self, x: Array, local: "_PointValues", outputs: "_LocalOutputs"
     ) -> "_NextSlopes":
         """Returns the derivatives of the next state, with all that it carries on."""
         maps = self._maps
@@ -113,7 +113,7 @@ class LogLinearizer:
         B[:, self._n :] += self._maps.carried_by_input
         return np.ascontiguousarray(B)
 
-    def _differentiate(self, x: Array, acting: Array) -> "_Point":
+    def _differentiate(self, x: Array, acting: Array) -> "_PointValues":
         """Evaluates features and nominal outputs, with their derivatives."""
         n = self._n
         model = self._model
@@ -128,7 +128,7 @@ class LogLinearizer:
 
         point = np.concatenate([x, acting], axis=-1)
         value, slopes = _central_differences(values, point, self._angles)
-        return _Point(
+        return _PointValues(
             features=value[:, :d],
             nominal=value[:, d:],
             features_by_point=slopes[:, :d],
@@ -150,7 +150,7 @@ class LogLinearizer:
         return slopes[..., :n], slopes[..., n:]
 
     def _outputs(
-        self, local: "_Point", memory: Array, covariance: bool
+        self, local: "_PointValues", memory: Array, covariance: bool
     ) -> "_LocalOutputs":
         """Returns the outputs at points, with their derivatives."""
         model = self._model
@@ -211,7 +211,7 @@ class LogLinearizer:
         return slopes
 
 
-class _Point(NamedTuple):
+class _PointValues(NamedTuple):
     """Functions of a state and of the inputs as they act, at K points."""
 
     features: Array  # z (K, d)

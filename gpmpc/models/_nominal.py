@@ -245,35 +245,50 @@ def check_slopes(
     *arguments: Array,
     angles: Sequence[int] = (),
 ) -> None:
-    """Raises ``SettingError`` where torch's derivatives are not those of the values.
+    """Raises ``SettingError`` where torch loses a part of a function's derivatives.
+
+    Where the function is not defined nothing can be compared. ``key`` is what it is,
+    for the message; other arguments are those of ``lost_derivative``.
+    """
+    try:
+        lost = lost_derivative(function, model, *arguments, angles=angles)
+    except GpmpcError:
+        raise
+    except Exception:
+        return
+    if lost is not None:
+        raise SettingError(key, lost)
+
+
+def lost_derivative(
+    function: Callable[..., Tensor],
+    model: Any,
+    *arguments: Array,
+    angles: Sequence[int] = (),
+) -> str | None:
+    """Says which derivative of a function torch loses; None where it loses none.
 
     A part that torch could not follow (``.detach()``, NumPy, ``torch.tensor``) is
-    missing in them. Central differences of two widths say what they should be, and how
-    far they are to be trusted: of values in single precision, or that bend within a
-    width, the two differ. An entry counts where it is wrong at every point at which it
-    is a number, so that a kink at one of them does not.
+    missing in its derivatives. Central differences of two widths say what they should
+    be, and how far they are to be trusted: of values in single precision, or that bend
+    within a width, the two differ. An entry counts where it is wrong at every point at
+    which it is a number, so that a kink at one of them does not.
 
     Args:
-        key: What the function is, for the message.
         function: See ``linearize_function``.
         model: Has the type and the device of the tensors.
         arguments: Points (K, d_i) each.
         angles: Columns of the first argument that are angles: they may count turns,
             which change no slope.
     """
-    try:
-        _, *jacobians = linearize_function(function, model, *arguments)
-        points = np.concatenate(arguments, axis=1)
-        width = _WIDTH * (1.0 + np.abs(points))
-        width[:, list(angles)] = _WIDTH
-        sizes = [argument.shape[1] for argument in arguments]
-        values_at = partial(_values_at, function, model, sizes)
-        narrow = _central_differences(values_at, points, width)
-        wide = _central_differences(values_at, points, 2.0 * width)
-    except GpmpcError:
-        raise
-    except Exception:  # not defined there: nothing can be compared
-        return
+    _, *jacobians = linearize_function(function, model, *arguments)
+    points = np.concatenate(arguments, axis=1)
+    width = _WIDTH * (1.0 + np.abs(points))
+    width[:, list(angles)] = _WIDTH
+    sizes = [argument.shape[1] for argument in arguments]
+    values_at = partial(_values_at, function, model, sizes)
+    narrow = _central_differences(values_at, points, width)
+    wide = _central_differences(values_at, points, 2.0 * width)
     K, v, _ = narrow.shape
     flat = [
         part.reshape(K, v, size) for part, size in zip(jacobians, sizes, strict=True)
@@ -285,16 +300,15 @@ def check_slopes(
     is_number = np.isfinite(excess)
     is_wrong = (is_off | ~is_number).all(axis=0) & is_number.any(axis=0)
     if not is_wrong.any():
-        return
+        return None
     output, column = np.argwhere(is_wrong)[0]
     point = np.flatnonzero(is_number[:, output, column])[0]
-    raise SettingError(
-        key,
+    return (
         "must be followed by torch as a whole: the derivative of its entry "
         f"{output + 1} by column {column + 1} of (x, u) is "
         f"{narrow[point, output, column]:.3g}, and torch finds "
         f"{slopes[point, output, column]:.3g} (a part is lost by .detach(), numpy or "
-        "torch.tensor)",
+        "torch.tensor)"
     )
 
 

@@ -3,6 +3,14 @@
 A loop measures the first states of such a model alone. What follows them is known from
 the rows before: inputs on their way, what lags hold, what is remembered. It is kept
 from step to step by ``at_rest``, where a flight begins, and ``follow``.
+
+Two numbers tell such models apart, and each has several names:
+
+- how many states are measured, the first ones: ``measured_dim`` of a model, all n
+  without a past; ``carried_dim`` of a ``LogDynamics`` is the rest. A controller's
+  problem weighs ``weighed_dim`` of them, these or all n;
+- after how many rows the state is known: ``past`` of a model with one,
+  ``rows_before`` of any. ``rows_back`` of a ``Memory`` is its part of it.
 """
 
 from dataclasses import replace

@@ -11,6 +11,7 @@ x[k+1] and f0 are no error of f0.
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any, cast
@@ -48,6 +49,7 @@ from gpmpc.models._residual_data import (
     Effect,
     Nominal,
     check_derivatives,
+    check_no_lost_derivative,
     counts_turns,
     describe_columns,
     effect_matrix,
@@ -65,8 +67,9 @@ class ResidualModel(TensorModel):
 
     Raises:
         ShapeError: The parts do not belong together.
-        SettingError: The residual predicts something else, an index is out of range, or
-            the noise is missing or no covariance.
+        SettingError: The residual predicts something else, an index is out of range,
+            the noise is missing or no covariance, or torch follows a part of a function
+            alone.
 
     >>> from gpmpc.datasets import RandomData
     >>> from gpmpc.gp import Trainer
@@ -116,6 +119,7 @@ class ResidualModel(TensorModel):
         check_signals(self.signals)
         self.signals.check_sizes(self.state_dim, self.input_dim)
         self._check_tensors()
+        check_no_lost_derivative(self.nominal, self.B, self, self.angles)
 
     def _check_kinds(self) -> None:
         """Raises ``SettingError`` unless the parts are of the right kind."""
@@ -242,7 +246,13 @@ class ResidualModel(TensorModel):
         )
         append = append_points if window is None else window.append
         residual = append(self.residual, data.features, data.targets)
-        return replace(self, residual=residual)
+        return self._with_points(residual)
+
+    def _with_points(self, residual: GPPosterior) -> "ResidualModel":
+        """Returns the model with other points of d; nothing else is to be checked."""
+        model = copy(self)
+        object.__setattr__(model, "residual", residual)
+        return model
 
     @cached_property
     def features(self) -> Features:

@@ -1,7 +1,7 @@
 """Data of a residual GP: the error of a nominal model, as far as B reaches it."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any, NamedTuple
@@ -24,7 +24,12 @@ from gpmpc.gp._data_checks import (
 )
 from gpmpc.models._casadi_function import CasadiFunction
 from gpmpc.models._features import Features
-from gpmpc.models._nominal import Affine, check_slopes
+from gpmpc.models._nominal import (
+    Affine,
+    check_slopes,
+    lost_derivative,
+    points_near_zero,
+)
 from gpmpc.models._tensors import check_like
 
 Nominal = Callable[[Tensor, Tensor], Tensor]
@@ -235,19 +240,50 @@ def _output_names(
 
 
 def check_derivatives(
-    nominal: Nominal, B: Effect, transitions: Transitions, angles: Sequence[int]
+    nominal: Nominal,
+    B: Effect,
+    transitions: Transitions,
+    angles: Sequence[int],
 ) -> None:
-    """Raises ``SettingError`` where torch cannot follow a function.
+    """Raises ``SettingError`` where torch cannot follow a function, or all of it.
 
     Training asks for no derivative: only a controller would come upon it. Errors of
     shape are left to the computation of the residuals, which names all rows.
     """
-    x = to_array(transitions.states[:2])
-    u = to_array(transitions.inputs[:2])
-    like = transitions.states
+    points = [to_array(part[:2]) for part in (transitions.states, transitions.inputs)]
     with suppress(ShapeError):
-        if not hasattr(nominal, "linearize"):
-            checked = partial(nominal_next_state, nominal, angles=())
-            check_slopes("nominal", checked, like, x, u, angles=angles)
-        if callable(B) and not hasattr(B, "linearize"):
-            check_slopes("B", partial(effect_matrix, B), like, x, angles=angles)
+        for key, function, arguments in _functions_of_torch(nominal, B, *points):
+            check_slopes(key, function, transitions.states, *arguments, angles=angles)
+
+
+def check_no_lost_derivative(
+    nominal: Nominal, B: Effect, model: Any, angles: Sequence[int]
+) -> None:
+    """Raises ``SettingError`` where torch follows a part of a function alone.
+
+    What a function raises near zero is no matter: it may be defined elsewhere.
+
+    Args:
+        nominal: f0.
+        B: Effect of the GP.
+        model: Has the type and the device of the functions' tensors.
+        angles: Indices of the states that are angles.
+    """
+    points = points_near_zero(model.state_dim, model.input_dim)
+    for key, function, arguments in _functions_of_torch(nominal, B, *points):
+        lost = None
+        with suppress(Exception):
+            lost = lost_derivative(function, model, *arguments, angles=angles)
+        if lost is not None:
+            raise SettingError(key, lost)
+
+
+def _functions_of_torch(
+    nominal: Nominal, B: Effect, states: Array, inputs: Array
+) -> Iterator[tuple[str, Callable[..., Tensor], tuple[Array, ...]]]:
+    """Yields names, functions without derivatives of their own, and their arguments."""
+    if not hasattr(nominal, "linearize"):
+        without_turns = partial(nominal_next_state, nominal, angles=())
+        yield "nominal", without_turns, (states, inputs)
+    if callable(B) and not hasattr(B, "linearize"):
+        yield "B", partial(effect_matrix, B), (states,)

@@ -76,12 +76,15 @@ class Wrapper(TensorModel):
 
 
 class LinearPart(NamedTuple):
-    """The matrices of a ``LinearWrapper`` of k states z and m inputs u."""
+    """The matrices of a ``LinearWrapper`` of k states z and m inputs u.
 
-    Z: Array  # input of the model by z (m, k)
-    W: Array  # input of the model by u (m, m)
-    L: Array  # next z by z, besides the model (k, k)
-    M: Array  # next z by u, besides the model (k, m)
+    z+ = [f(x, Z z + W u); 0] + L z + M u, where f is the model inside.
+    """
+
+    Z: Array  # what f takes as input, by z (m, k)
+    W: Array  # likewise by u (m, m)
+    L: Array  # what is added to f, by z (k, k)
+    M: Array  # likewise by u (k, m)
 
 
 class LinearWrapper(Wrapper):

@@ -25,7 +25,7 @@ from gpmpc.propagation._propagator import (
     Propagation,
     Sensitivity,
     checked_arguments,
-    holds_for,
+    claim_holds,
 )
 
 
@@ -113,7 +113,7 @@ class Linearization(NoisyPropagator):
 
         Not of a subclass that propagates in another way, or the variances alone.
         """
-        return not self.diagonal and holds_for(self, "first_order")
+        return not self.diagonal and claim_holds(self, "first_order")
 
     def differentiate(
         self, model: Any, belief: Gaussian, input: Tensor | None = None

@@ -240,14 +240,15 @@ def _derivatives(
     """
     A = form.A
     n = S.shape[-1]
-    residual = _derivatives_of_residual(form, f, df, n, m)  # of B M and B V B'
+    through_gps = _derivatives_of_residual(form, f, df, n, m)  # of B M and B V B'
+    mean_by_input = through_gps.mean_by_input
     if form.G is not None:
-        residual = replace(residual, mean_by_input=form.G + residual.mean_by_input)
+        mean_by_input = form.G + mean_by_input
     if A is None:
-        return residual
+        return replace(through_gps, mean_by_input=mean_by_input)
     assert df.dJ_dS is not None  # those of J are computed where A is not zero
     assert df.dJ_du is not None
-    BJ = residual.mean_by_mean
+    BJ = through_gps.mean_by_mean
     # Sigma+ has A C = A S (B J)' and its transpose. They change with J ...
     AS = A @ S
     if form.states is not None:
@@ -265,13 +266,13 @@ def _derivatives(
     )
     return Sensitivity(
         mean_by_mean=A + BJ,
-        mean_by_covariance=residual.mean_by_covariance,
-        mean_by_input=residual.mean_by_input,
-        covariance_by_mean=residual.covariance_by_mean + by_mean,
-        covariance_by_covariance=residual.covariance_by_covariance
+        mean_by_covariance=through_gps.mean_by_covariance,
+        mean_by_input=mean_by_input,
+        covariance_by_mean=through_gps.covariance_by_mean + by_mean,
+        covariance_by_covariance=through_gps.covariance_by_covariance
         + by_covariance
         + (by_inner_covariance + by_inner_covariance.mT) / 2,
-        covariance_by_input=residual.covariance_by_input + by_input,
+        covariance_by_input=through_gps.covariance_by_input + by_input,
     )
 
 

@@ -403,8 +403,9 @@ def _with_turns(
         expected_deviations = steps[..., [states[a] for a in angles]]
     turns = whole_turns(deviations - expected_deviations)
     if states is not None:
-        # Two turns on, a model that wraps its angles stays where it was, up to one
-        # turn at the border; one that counts turns moves on by two.
+        # Two turns on, an angle that the model wraps moves by none, or by one where it
+        # crosses the border; one whose turns it counts moves by two, which are no
+        # error.
         two_turns = torch.zeros_like(belief.mean)
         two_turns[..., [states[a] for a in angles]] = 2 * TURN
         displacement = model.predict(belief.mean + two_turns, input).mean - centre

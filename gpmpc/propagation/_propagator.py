@@ -25,7 +25,7 @@ from gpmpc.gaussian import (
 from gpmpc.signals import Signals, signals_of
 
 # the methods that make a step: who overrides one propagates in another way
-_STEPS = {"propagate", "_next_moments", "_add_noise_and_project"}
+_STEP_METHODS = {"propagate", "_next_moments", "_add_noise_and_project"}
 _LAST_PLACES = 2**12  # units in it, of the round-off that a covariance may have
 
 
@@ -226,25 +226,29 @@ def differentiate(
     """
     check_method("propagator", propagator, "propagate", "Linearization()")
     closed_form = getattr(propagator, "differentiate", None)
-    if closed_form is not None and holds_for(propagator, "differentiate"):
+    if closed_form is not None and claim_holds(propagator, "differentiate"):
         result = closed_form(model, belief, input)
         if result is not None:
             return result
     return by_autograd(propagator, model, belief, input)
 
 
-def holds_for(propagator: Any, name: str) -> bool:
-    """Whether what a class says of its way to propagate holds for a propagator.
+def claim_holds(propagator: Any, claim: str) -> bool:
+    """Whether what a class says of its way to propagate is of a propagator's own way.
 
     A subclass that propagates in another way inherits what is no longer true: from the
     class upwards, it counts which comes first, the claim or another step.
+
+    Args:
+        propagator: Of the class.
+        claim: Attribute or method that says it: ``first_order``, ``differentiate``.
     """
-    if name in getattr(propagator, "__dict__", {}):
+    if claim in getattr(propagator, "__dict__", {}):
         return True
     for owner in type(propagator).__mro__:
-        if name in vars(owner):
+        if claim in vars(owner):
             return True
-        if not _STEPS.isdisjoint(vars(owner)):
+        if not _STEP_METHODS.isdisjoint(vars(owner)):
             return False
     return True
 
