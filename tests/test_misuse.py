@@ -207,6 +207,14 @@ def test_models_and_data_say_what_they_are_in_one_line():
             "model: must be a DynamicsModel, such as GPPosterior; got str",
         ),
         (
+            lambda: ModelLoop(posterior(predicts="value"), Linearization()),
+            "model: must predict the next state; got GPs with predicts='value'",
+        ),
+        (
+            lambda: ModelLoop(posterior(), Linearization),
+            "propagator: .*such as Linearization.*got the class Linearization",
+        ),
+        (
             lambda: controller(problem={"Q": [1]}),
             r"problem: must be Problem\(...\); got dict",
         ),

@@ -55,9 +55,10 @@ class OutputNoise:
         Args:
             factors: By which they change, by step and entry (S, e) or (S, 1).
         """
-        return replace(
-            self, scales=factors * self.scales, largest=factors * self.largest
-        )
+        largest = self.largest
+        if largest.size:  # older files have none beside their scales
+            largest = factors * largest
+        return replace(self, scales=factors * self.scales, largest=largest)
 
     def scales_at(self, steps: Sequence[int]) -> Array:
         """Returns factors (steps, e) of the variances that the sources explain.

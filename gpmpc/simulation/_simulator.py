@@ -16,7 +16,7 @@ import torch
 from gpmpc._angles import angles_of
 from gpmpc._arrays import UNMEASURED, is_measured, read_array
 from gpmpc._calls import explains_arguments
-from gpmpc._dynamics import DynamicsModel, to_array
+from gpmpc._dynamics import DynamicsModel, check_next_states, to_array
 from gpmpc.exceptions import (
     DataError,
     Diverged,
@@ -44,7 +44,8 @@ class ModelLoop:
     """A learned model rolled on itself.
 
     Raises:
-        SettingError: A time step that is not positive.
+        SettingError: The time step is not positive, the model predicts something else
+            than next states, or the propagator is none.
 
     See Also:
         ``closed_loop``, which takes one in the place of a system.
@@ -56,6 +57,8 @@ class ModelLoop:
     time_step: float = cast(float, None)
 
     def __post_init__(self) -> None:
+        check_next_states(self.model)
+        check_method("propagator", self.propagator, "propagate", "Linearization()")
         signals = signals_of(self.model)
         if self.time_step is None:
             object.__setattr__(self, "time_step", signals.time_step or 1.0)

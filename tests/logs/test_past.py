@@ -312,6 +312,13 @@ def test_names_with_prefixes_are_ordered_by_what_tells_them_apart(own, names, or
     assert order_by_name(own, [names]) == order
 
 
+def test_noise_without_largest_variances_has_none_when_it_is_scaled():
+    noise = OutputNoise(np.ones((4, 2)), np.ones(2), (1, 10), np.ones((2, 2)))
+    twice = noise.scaled(np.full((2, 1), 2.0))
+    assert (twice.scales == 2.0).all()
+    assert np.isinf(twice.largest_at([1, 5])).all()
+
+
 def test_misuse_of_a_memory_is_named():
     with pytest.raises(SettingError, match="products: must be of 2 rows at most"):
         Memory(rows=1, products=Products(3, 2, (0.0,), (1.0,)))
