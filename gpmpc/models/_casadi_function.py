@@ -199,7 +199,24 @@ class CasadiFunction:
         jacobian = np.empty((K, rows * columns, points.shape[1]))
         linearize_tape.unchecked(self.tape, points, values, jacobian)
         ends = np.cumsum(self.sizes)[:-1]
-        return [values, *np.split(jacobian, ends, axis=2)]
+        by_arguments = np.split(jacobian, ends, axis=2)
+        if not np.isfinite(jacobian).all() and np.isfinite(values).all():
+            return [values, *self._known_derivatives(by_arguments, arguments)]
+        return [values, *by_arguments]
+
+    def _known_derivatives(
+        self, by_arguments: list[Array], arguments: tuple[Array, ...]
+    ) -> list[Array]:
+        """Returns derivatives of loops, those of CasADi where they are not finite.
+
+        The loops multiply the endless slope of sqrt(p) at zero with the zero by which p
+        depends on x, which is no number; CasADi knows what does not depend on x.
+        """
+        _, *of_casadi = self._linearize_by_casadi(*arguments)
+        return [
+            np.where(np.isfinite(own), own, other)
+            for own, other in zip(by_arguments, of_casadi, strict=True)
+        ]
 
     def _linearize_by_casadi(self, *arguments: Array) -> list[Array]:
         """Linearises by CasADi: (K, size), and (K, size, d_i) each."""

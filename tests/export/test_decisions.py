@@ -642,23 +642,51 @@ def exploding():
     return gpmpc(problem, model, covariance="none", rolled_out=True)
 
 
+def beside_a_standing_obstacle():
+    """Farther away the faster it is, by the root of squares that are zero."""
+    x = casadi.SX.sym("x", 2)
+    u = casadi.SX.sym("u")
+    p = casadi.SX.sym("p", 2)
+    h = casadi.Function("h", [x, u, p], [x[0] - 1.2 + casadi.norm_2(p)])
+    still = Affine(torch.eye(2), torch.tensor([[0.2], [0.0]]), torch.zeros(2))
+    problem = Problem(WEIGHTS, TORQUES, constraints=[Inequality(h)])
+    return gpmpc(problem, KnownModel(still, 2, 1), covariance="none")
+
+
+# controller, first state, goal, parameters, and how a decision ends
 BEYOND_NUMBERS = {
-    "a bound at the guess": (leaking_tank(lambda x: x[0]), Status.FUNCTION_NOT_FINITE),
-    "no bound at the guess": (leaking_tank(lambda x: x[1] + 1.0), Status.SOLVED),
-    "a roll-out": (exploding(), Status.SOLVED),
+    "a bound at the guess": (
+        leaking_tank(lambda x: x[0]),
+        1.0,
+        -5.0,
+        None,
+        Status.FUNCTION_NOT_FINITE,
+    ),
+    "no bound at the guess": (
+        leaking_tank(lambda x: x[1] + 1.0),
+        1.0,
+        -5.0,
+        None,
+        Status.SOLVED,
+    ),
+    "a roll-out": (exploding(), 0.0, 40.0, None, Status.SOLVED),
+    "a slope by parameters": (
+        beside_a_standing_obstacle(),
+        1.0,
+        2.0,
+        [0.0, 0.0],
+        Status.SOLVED,
+    ),
 }
 
 
 @pytest.mark.parametrize("name", BEYOND_NUMBERS)
 def test_what_has_no_number_ends_as_in_python(name):
-    controller, status = BEYOND_NUMBERS[name]
+    controller, state, goal, parameters, status = BEYOND_NUMBERS[name]
     compiled = CompiledController(controller, compiler=COMPILER)
-    belief = Gaussian.certain([1.0, 0.0])
-    goal = Reference(np.array([-5.0, 0.0]))
-    if name == "a roll-out":
-        belief = Gaussian.certain([0.0, 0.0])
-        goal = Reference(np.array([40.0, 0.0]))
-    expected = controller.control(belief, goal)
-    got = compiled.control(belief, goal)
+    belief = Gaussian.certain([state, 0.0])
+    reference = Reference(np.array([goal, 0.0]))
+    expected = controller.control(belief, reference, parameters=parameters)
+    got = compiled.control(belief, reference, parameters=parameters)
     assert got.status is expected.status is status
     assert np.abs(got.inputs - expected.inputs).max() < 1e-9
