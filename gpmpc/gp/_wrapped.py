@@ -34,6 +34,9 @@ DECLARE = (
 )
 
 
+RADIANS = "2 pi"  # a turn in words
+
+
 class Turn(NamedTuple):
     """A whole turn in a unit."""
 
@@ -44,7 +47,7 @@ class Turn(NamedTuple):
 
 # Many honest states reach hundreds, few of them 6: what counts for degrees is stricter.
 _TURNS = (
-    Turn(size=TURN, words="2 pi", far_smaller=1 / 6),
+    Turn(size=TURN, words=RADIANS, far_smaller=1 / 6),
     Turn(size=360.0, words="360", far_smaller=1 / 36),
 )
 

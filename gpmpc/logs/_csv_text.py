@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from gpmpc.exceptions import DataError
 from gpmpc.logs._csv_numbers import doubtful_columns
-from gpmpc.logs._units import is_known
+from gpmpc.logs._units import is_known, is_name_of_time, unit_of_time
 
 WHITE_SPACE = " "  # as a delimiter: any number of spaces and tabs
 #: the first of those that fit equally well is taken
@@ -29,6 +29,7 @@ _WIDE_SPACE = re.compile(r"\t| {2,}")
 _BRACKETS = re.compile(r"\[.*\]|\(.*\)")
 _ABSENT = frozenset(("", "NA", "N/A", "n/a", "null", "NULL", "None", "<NA>"))
 _SAMPLE = 50  # lines by which the text is recognised
+_LONGEST_HEAD = 1000  # lines in which rows are looked for
 _COMMENTS = 50  # before the first line that may hold the names of the columns
 _HEADER = 2  # lines before the rows that may hold the names, and the units
 _START = 1000  # bytes that the encoding is looked for in
@@ -100,12 +101,12 @@ def open_csv(where: str, file: io.BufferedReader) -> CsvText:
         DataError: It is no such text; the message says why.
     """
     lines = _Lines(where, file)
-    head = list(islice(lines, 1 + _SAMPLE))
+    head = _read_head(lines)
     if not head:
         raise DataError(
             f"{where}: holds no line with the names of the columns, or rows"
         )
-    delimiter = _find_delimiter(head)
+    delimiter = _find_delimiter(head[-_SAMPLE:])
     fields = [_split_line(line, delimiter) for line in head]
     first = _first_row(fields, delimiter)
     rows = fields[first:]
@@ -126,6 +127,30 @@ def open_csv(where: str, file: io.BufferedReader) -> CsvText:
         skipped=header.skipped,
         lines_before_rows=first,
     )
+
+
+def _read_head(lines: Iterator[str]) -> list[str]:
+    """Reads lines until the last ones are rows, as far as a program's settings go."""
+    head = list(islice(lines, 1 + _SAMPLE))
+    while len(head) < _LONGEST_HEAD and not _are_rows(head[-_SAMPLE:]):
+        following = list(islice(lines, _SAMPLE))
+        if not following:
+            break
+        head += following
+    return head
+
+
+def _are_rows(lines: Sequence[str]) -> bool:
+    """Tells whether lines are surely rows: equally wide, and each begins with a number.
+
+    Settings begin with their names. So may rows: then all of the head is looked at.
+    """
+    if not lines:
+        return False
+    delimiter = _find_delimiter(lines)
+    fields_of_lines = [_split_line(line, delimiter) for line in lines]
+    is_even = len({len(fields) for fields in fields_of_lines}) == 1
+    return is_even and all(_is_number(fields[0]) for fields in fields_of_lines)
 
 
 class _Lines(Iterator[str]):
@@ -276,33 +301,48 @@ def _first_row(lines: Sequence[Fields], delimiter: str) -> int:
     """Finds the first line of values; the one behind the first if none has a number.
 
     What an instrument writes above the rows has numbers too. Between white space rows
-    are as wide as most lines; elsewhere their last cells may be missing, but they do
-    not begin with a text where most begin with a number.
+    are as wide as most lines at the end of the sample; elsewhere their last cells may
+    be missing, but they do not begin with a text where most begin with a number.
     """
     is_numeric = [any(map(_is_number, fields)) for fields in lines]
     widths = Counter(
         len(fields)
-        for fields, numeric in zip(lines, is_numeric, strict=True)
+        for fields, numeric in zip(lines[-_SAMPLE:], is_numeric[-_SAMPLE:], strict=True)
         if numeric
     )
     usual_width = widths.most_common(1)[0][0] if widths else 0
-    begins = [_is_text(fields[0]) for fields in lines if len(fields) == usual_width]
+    is_whole = [
+        numeric and len(fields) == usual_width
+        for fields, numeric in zip(lines, is_numeric, strict=True)
+    ]
+    begins = [_is_text(lines[i][0]) for i, whole in enumerate(is_whole) if whole]
     begin_with_text = sum(begins) > len(begins) / 2
-    for index, fields in enumerate(lines):
-        is_first = index == 0 and len(lines) > 1
-        is_header = is_first and (
-            _names_numbers(fields, lines[1])
-            or _counts_columns(fields)
-            or _counts_from_zero(fields, lines[1])
-        )
-        fits = len(fields) == usual_width
-        if delimiter != WHITE_SPACE and not fits:
-            fits = begin_with_text or not _is_text(fields[0])
-        if is_numeric[index] and fits and not is_header:
+
+    def may_be_short_row(index: int) -> bool:
+        """Tells whether a line may be a row whose last cells are missing."""
+        if delimiter == WHITE_SPACE or not is_numeric[index]:
+            return False
+        if _is_text(lines[index][0]):
+            return begin_with_text and index + 1 < len(lines) and is_whole[index + 1]
+        return True
+
+    for index in range(len(lines)):
+        if index == 0 and len(lines) > 1 and _is_header(lines[0], lines[1]):
+            continue
+        if is_whole[index] or may_be_short_row(index):
             while index > 0 and not any(lines[index - 1]):  # rows without a value
                 index -= 1
             return index
     return 1
+
+
+def _is_header(fields: Fields, below: Fields) -> bool:
+    """Tells whether a line with numbers names columns, or counts them."""
+    return (
+        _names_numbers(fields, below)
+        or _counts_columns(fields)
+        or _counts_from_zero(fields, below)
+    )
 
 
 def _names_numbers(fields: Fields, below: Fields) -> bool:
@@ -368,7 +408,7 @@ def _last_names(
     """Returns the names in the last line that has some, and the units in one behind."""
     candidates = [_split_names(line, rows, separators) for line in lines]
     candidates = [names for names in candidates if names]
-    if len(candidates) > 1 and _are_units(candidates[-1]):
+    if len(candidates) > 1 and _are_units(candidates[-1], candidates[-2]):
         units = [field.strip("[]() ") for field in candidates[-1]]
         return candidates[-2], units
     return (candidates[-1], []) if candidates else ([], [])
@@ -406,10 +446,20 @@ def _count_filled(fields: Fields) -> int:
     return filled[-1] + 1 if filled else 0
 
 
-def _are_units(fields: Fields) -> bool:
-    """Tells whether all fields are units, such as ``[s]`` and ``N m``."""
-    return all(
-        is_known(field.strip("[]() ")) or _BRACKETS.fullmatch(field) for field in fields
+def _are_units(fields: Fields, names: Fields) -> bool:
+    """Tells whether fields below names are units, such as ``[s]`` and ``N m``.
+
+    All are known, or one is a unit of times and stands below the name of a time: then
+    others are units that are not known here.
+    """
+    units = [field.strip("[]() ") for field in fields]
+    are_known = all(
+        is_known(unit) or _BRACKETS.fullmatch(field)
+        for unit, field in zip(units, fields, strict=True)
+    )
+    return are_known or any(
+        unit_of_time(unit) and is_name_of_time(name)
+        for unit, name in zip(units, names, strict=False)
     )
 
 

@@ -300,6 +300,7 @@ def _inspect_stream(
     source: _Source, times: _Times, mapping: LogMapping | None
 ) -> _Stream:
     """Inspects the rows of one table."""
+    source = source._replace(table=_with_numbers(source.table))
     table = source.table
     stamps = times.stamps
     clock = _read_clock(stamps)
@@ -337,6 +338,19 @@ def _inspect_stream(
             _title(source.title, name) for name in columns if name not in numeric
         ],
     )
+
+
+def _with_numbers(table: pd.DataFrame) -> pd.DataFrame:
+    """Makes numbers of the booleans and texts that ``read_log`` takes for numbers."""
+    columns = {}
+    for name in table.columns:
+        column = table[name]
+        if column.dtype.kind in "iufmM":
+            continue
+        numbers = pd.to_numeric(column, errors="coerce").astype(float)
+        if numbers.notna().any() and (numbers.notna() | column.isna()).all():
+            columns[name] = numbers
+    return table.assign(**columns)
 
 
 def _warn_of_width(title: str, channels: int) -> list[str]:
@@ -567,7 +581,8 @@ def _dependence_warnings(dependence: Mapping[str, float]) -> list[str]:
 def input_dependence(log: Log) -> dict[str, float]:
     """Returns the share of each input's variance that the states explain.
 
-    They explain it by a linear function of themselves and of their squares.
+    They explain it by a linear function of themselves and of their squares. What as
+    many weights explain by chance does not count.
     """
     states = np.concatenate([run.states for run in log])
     inputs = np.concatenate([run.inputs for run in log])
@@ -575,6 +590,8 @@ def input_dependence(log: Log) -> dict[str, float]:
     features = np.column_stack([scaled, scaled**2])
     weights = fit_affine(features, inputs)
     unexplained = (inputs - features @ weights[:-1]).var(axis=0)
+    rows = len(features)
+    unexplained *= rows / max(rows - len(weights), 1)
     return _explained_shares(log.different_input_names, unexplained, inputs.var(axis=0))
 
 
@@ -583,7 +600,7 @@ def _explained_shares(
 ) -> dict[str, float]:
     """Returns explained shares of variances (m,), of those that are not zero."""
     return {
-        name: 1 - float(residual / variance)
+        name: max(1 - float(residual / variance), 0.0)
         for name, residual, variance in zip(names, unexplained, variances, strict=True)
         if variance > 0
     }

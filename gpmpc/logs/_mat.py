@@ -35,6 +35,9 @@ _PIECE = 2**20  # that is unfolded at once [bytes]
 _HDF5 = b"MATLAB 7.3"
 
 
+_OPAQUE_FIELDS = ("s0", "s1", "s2")  # name, system and class of objects, for SciPy
+
+
 class _Array(NamedTuple):
     """Values with the name by which MATLAB finds them."""
 
@@ -53,7 +56,7 @@ def read_mat(path: Path, options: ReadOptions) -> LogFile:
         arrays = list(_arrays_of_version_5(path, head, budget))
     columns: dict[str, np.ndarray] = {}
     unread = []
-    for name, values in arrays:
+    for name, values in map(_without_single_axes, arrays):
         if not _holds_columns(values):
             unread.append(name)
             continue
@@ -62,6 +65,18 @@ def read_mat(path: Path, options: ReadOptions) -> LogFile:
     longest = max(map(len, columns.values()), default=0)
     budget.take(NUMBER_BYTES * longest * len(columns), "its table")
     return LogFile({"": padded_table(columns)}, unread_columns(path, unread))
+
+
+def _without_single_axes(array: _Array) -> _Array:
+    """Leaves out axes of length 1 that an array has beyond two.
+
+    Simulink writes a signal of K samples as 1 x 1 x K.
+    """
+    values = array.values
+    if not isinstance(values, np.ndarray) or values.ndim < 3:
+        return array
+    values = values.squeeze()
+    return array._replace(values=np.atleast_2d(values) if values.size else values)
 
 
 def _holds_columns(values: Any) -> bool:
@@ -99,7 +114,13 @@ def _inner_arrays(name: str, values: Any) -> Iterator[_Array]:
     """Yields the arrays inside a structure or a cell array; others as they are."""
     is_list = isinstance(values, np.ndarray) and values.size > 1
     fields = values.dtype.names if isinstance(values, np.ndarray) else None
-    if fields:
+    if fields and fields[:3] == _OPAQUE_FIELDS:
+        entry = values.flat[0]
+        variable = _plain_text(entry["s0"])
+        kind = _plain_text(entry["s2"])
+        label = f"{variable} (a {kind} object of MATLAB: save its numbers as an array)"
+        yield _Array(label, None)
+    elif fields:
         for number, entry in enumerate(values.flat, start=1):
             prefix = f"{name}({number})" if is_list else name
             for field in fields:
@@ -109,6 +130,10 @@ def _inner_arrays(name: str, values: Any) -> Iterator[_Array]:
             yield from _inner_arrays(f"{name}{{{number}}}", entry)
     else:
         yield _Array(name, values)
+
+
+def _plain_text(text: Any) -> str:
+    return text.decode("ascii", "replace") if isinstance(text, bytes) else str(text)
 
 
 def _check_elements(path: Path, budget: MemoryBudget) -> None:

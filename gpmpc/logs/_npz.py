@@ -76,6 +76,8 @@ def read_npz(path: Path, options: ReadOptions) -> LogFile:
     with np.load(path, allow_pickle=False) as archive:
         for name, array in tables.items():
             values: Any = np.atleast_1d(archive[name])
+            if array.shape:
+                values = values.reshape(array.shape)
             if array.dtype.kind == "S":
                 values = np.char.decode(values, "utf-8", "replace")
             if array.is_row:
@@ -133,4 +135,6 @@ def _read_head(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> _DeclaredAr
             shape, _, dtype = np.lib.format.read_array_header_2_0(file)
         else:  # of structured arrays, which are no columns
             return _DeclaredArray(shape=(), dtype=np.dtype(object))
+    if len(shape) > 2:  # axes of length 1, as Simulink's signals have them
+        shape = tuple(length for length in shape if length != 1) or (1,)
     return _DeclaredArray(shape=shape, dtype=dtype)

@@ -83,6 +83,7 @@ def read_log(
             runs.append(run)
     _check_unchanging(runs, findings)
     _check_content(runs, paths, findings)
+    _check_neighbours(paths[0], runs, tables, mapping)
     _note_unlike_entries(runs, mapping, findings)
     _note_copied_states(runs, mapping, findings)
     equal_runs = _note_equal_runs(runs, findings)
@@ -192,6 +193,37 @@ def _check_common_rows(
     """
     if any((~np.isnan(table.values)).all(axis=1).any() for table in tables):
         return
+    _refuse_sparse_signals(
+        first_path, "no row has a value of every signal", tables, mapping
+    )
+
+
+def _check_neighbours(
+    first_path: Path,
+    runs: Sequence[LogRun],
+    tables: Sequence[RunTable],
+    mapping: LogMapping,
+) -> None:
+    """Raises ``DataError`` where no row with all values follows another one.
+
+    So it is where a signal of fewer rows is written into the table of a faster one.
+    """
+    longest = max(end - begin for run in runs for begin, end in run.pieces)
+    is_complete = all(not np.isnan(table.values).any() for table in tables)
+    if longest > 1 or is_complete:
+        return
+    _refuse_sparse_signals(
+        first_path,
+        "no two rows with a value of every signal follow each other",
+        tables,
+        mapping,
+    )
+
+
+def _refuse_sparse_signals(
+    first_path: Path, fault: str, tables: Sequence[RunTable], mapping: LogMapping
+) -> None:
+    """Raises ``DataError`` with the rows that each signal has, and what to do."""
     has_value = ~np.isnan(np.concatenate([table.values for table in tables]))
     counts: dict[str, int] = {}  # of rows with a value, by signal
     first = 0
@@ -207,8 +239,7 @@ def _check_common_rows(
         remedy = "name columns that hold values"
     listed = ", ".join(f"{name} in {count}" for name, count in counts.items())
     raise DataError(
-        f"{first_path}: no row has a value of every signal: of {len(has_value)} rows, "
-        f"{listed}; {remedy}"
+        f"{first_path}: {fault}: of {len(has_value)} rows, {listed}; {remedy}"
     )
 
 

@@ -9,7 +9,9 @@ from gpmpc.logs._file import STAMP
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._signals import holds_times, read_column, seconds
 from gpmpc.logs._units import (
+    NAMES_OF_TIMES,
     TIME_UNITS,
+    is_name_of_time,
     is_no_unit,
     unit_in_name,
     unit_of_time,
@@ -17,13 +19,8 @@ from gpmpc.logs._units import (
     units_of,
 )
 
-# columns that hold the time where nobody says which, in small or large letters; but T
-# is rather a temperature
-TIMES = (
-    STAMP,
-    *("timestamp", "t", "time", "stamp", "seconds", "datetime", "elapsed"),
-    *("zeit", "zeitstempel"),
-)
+# columns that hold the time where nobody says which
+TIMES = (STAMP, *NAMES_OF_TIMES)
 _SAMPLE = 50  # rows in which texts are looked at: are they dates?
 _SAME_SPAN = 0.02  # of the time that a log took: a clock in its messages goes as far
 LATEST_UNSTATED = 1e11  # [s] since 1970, in the year 5138
@@ -76,8 +73,7 @@ def usual_time_column(table: pd.DataFrame) -> str:
     columns = [str(name) for name in table]
     for time in TIMES:
         for name in columns:
-            is_in_large = len(name) > 1 and name.casefold() == time
-            if name == time or is_in_large:
+            if name == time or (is_name_of_time(name) and name.casefold() == time):
                 return name
     for name in columns:
         if unit_in_name(name):

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from gpmpc._angles import wrap
 from gpmpc._dynamics import Array
 from gpmpc.exceptions import DataError
-from gpmpc.gp._wrapped import wrapped_columns
+from gpmpc.gp._wrapped import RADIANS, wrapped_columns
 from gpmpc.logs._columns import check_column
 from gpmpc.logs._dropouts import sentinels, zero_dropouts
 from gpmpc.logs._findings import RunFindings
@@ -214,7 +214,11 @@ def _note_undeclared_angles(
         rows = behind[present[:, column]]
         after = values[rows, column][:, None]
         before = values[rows - 1, column][:, None]
+        # whole numbers from 0 to 6 are no radians
+        is_counter = not (values[behind, column] % 1).any()
         for wrapped in wrapped_columns(before, after):
+            if is_counter and wrapped.turn == RADIANS:
+                continue
             text = (
                 f"{name} jumps by a whole turn ({wrapped.turn}) {wrapped.rows} times, "
                 "and is taken as a plain number, also by a rate: is it an angle? "

@@ -62,6 +62,11 @@ SYMBOLS = {
     "rpm": Conversion("rad/s", float(np.pi / 30)),
     "g": Conversion("m/s2", 9.80665),  # standard gravity, not the gram
 }
+# in small letters; others are taken for the time where these are not there
+NAMES_OF_TIMES = (
+    *("timestamp", "t", "time", "stamp", "seconds", "datetime", "elapsed"),
+    *("zeit", "zeitstempel"),
+)
 TIME_UNITS = {  # of the times of rows [s]
     "s": 1.0,
     "ms": 1e-3,
@@ -152,6 +157,11 @@ def unit_of_time(text: str) -> str:
     """
     symbols = _as_symbols(text.strip())
     return symbols if symbols in TIME_UNITS else ""
+
+
+def is_name_of_time(name: str) -> bool:
+    """Tells whether a column is called as times are; T is rather a temperature."""
+    return name == "t" or (len(name) > 1 and name.casefold() in NAMES_OF_TIMES)
 
 
 def is_no_unit(text: str) -> bool:

@@ -118,6 +118,9 @@ def test_marks_of_thousands_are_refused(tmp_path, rows, mark):
         ("t,x [km/h],u\n", "m/s", "x [km/h] in km/h (taken as m/s)"),
         ("t,x [km/h],u\n", "km/h", ""),
         ("t,x (left),u [A]\n", "m", ""),
+        ("t,x[1],u (1)\n", "cm", ""),
+        ("t,x [\N{MICRO SIGN}m],u\n", "", ""),
+        ("t,x [\N{DEGREE SIGN}/s],u\n", "rad/s", "{x} in {unit} (taken as rad/s)"),
     ],
 )
 def test_units_that_the_file_says_and_the_mapping_does_not_are_found(
@@ -130,6 +133,8 @@ def test_units_that_the_file_says_and_the_mapping_does_not_are_found(
         tmp_path / "log.csv", {"time": "t", "states": states, "inputs": {"u": [u]}}
     )
     texts = [finding.text for finding in log.findings]
+    unit_in_file = x.partition("[")[2].rstrip("]")
+    said = said.format(x=x, unit=unit_in_file)
     whole = f"the file says other units than the mapping: {said}"
     assert texts == ([whole] if said else [])
 
@@ -215,6 +220,18 @@ def test_a_column_may_be_called_by_a_hexadecimal_number(tmp_path):
     mapping = LogMapping.load(tmp_path / "map.yaml")
     assert mapping.signal_columns == ("0x1A", "010", "0b1", "10")
     assert mapping.rate == 10
+
+
+@pytest.mark.parametrize("settings", [1, 60, 400])
+@pytest.mark.parametrize("dates", [False, True])
+def test_any_number_of_settings_may_stand_before_the_rows(tmp_path, settings, dates):
+    table = TABLE.assign(t=pandas.to_datetime(TABLE["t"], unit="s")) if dates else TABLE
+    lines = [f'"setting {k}","{k}"\n' for k in range(settings)]
+    (tmp_path / "log.csv").write_text("".join(lines) + table.to_csv(index=False))
+    file = read_file(tmp_path / "log.csv")
+    np.testing.assert_array_equal(file.tables[""][["x", "u"]], TABLE[["x", "u"]])
+    (finding,) = file.findings
+    assert (finding.kind, finding.count) == ("lines before the rows", settings)
 
 
 def test_counted_columns_are_no_row(tmp_path):

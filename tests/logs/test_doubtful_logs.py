@@ -384,9 +384,19 @@ def test_an_angle_that_nobody_declared_is_noted(tmp_path, role, unit, rate):
     table["yaw"] = np.mod(10.0 * np.arange(300) + 180, 360) - 180
     signals = {**MAPPING.get(role, {}), "heading": {"columns": ["yaw"], "unit": unit}}
     mapping = {**MAPPING, role: signals, "rate": rate}
+    table["u"] = np.arange(300) % 7  # a counter
     turn = "2 pi" if unit else "360"
     (text,) = texts(read_log(written(tmp_path, table), mapping), "turns")
     assert text.startswith(f"yaw jumps by a whole turn ({turn}) 8 times, and is taken")
+
+
+def test_a_slower_signal_in_the_table_of_a_faster_one_is_refused(tmp_path):
+    table = table_of()
+    table["x"] = table["x"].where(table.index % 10 == 0)
+    with pytest.raises(DataError, match="follow each .*rows, x in 30, .*state a rate"):
+        read_log(written(tmp_path, table), MAPPING)
+    log = read_log(written(tmp_path, table), {**MAPPING, "rate": 10})
+    assert len(log) > 280
 
 
 def test_rows_that_two_files_share_are_noted(tmp_path):

@@ -85,6 +85,25 @@ def test_an_input_that_follows_the_states_is_named(table, tmp_path):
         inspect_log(tmp_path / "bare.csv", mapping, time="a")
 
 
+def test_few_rows_do_not_make_an_input_follow_its_states(tmp_path):
+    rng = np.random.default_rng(0)
+    names = [f"x{i}" for i in range(12)]
+    table = pandas.DataFrame(rng.normal(size=(30, 12)), columns=names)
+    table.insert(0, "t", 0.1 * np.arange(30))
+    table.assign(u=rng.normal(size=30)).to_csv(tmp_path / "log.csv", index=False)
+    mapping = {"time": "t", "states": {"x": names}, "inputs": {"u": ["u"]}}
+    inspection = inspect_log(tmp_path / "log.csv", LogMapping.from_dict(mapping))
+    assert inspection.follows["u"] < 0.7
+
+
+def test_booleans_and_numbers_in_texts_are_channels(tmp_path):
+    lines = [f"{k / 10};{k % 3 > 0};{k % 7}\n" for k in range(90)]
+    (tmp_path / "log.csv").write_text("t;enabled;x\n" + "".join(lines) + "9;True;0,5\n")
+    inspection = inspect_log(tmp_path / "log.csv")
+    assert list(inspection.channels.index) == ["enabled", "x"]
+    assert not [text for text in inspection.warnings if "no numbers" in text]
+
+
 def test_the_command_writes_a_page(table, tmp_path):
     table.to_csv(tmp_path / "log.csv", index=False)
     result = forked("log", "inspect", "log.csv", cwd=tmp_path)

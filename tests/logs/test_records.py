@@ -99,6 +99,21 @@ def matlab_structure(folder):
     return path, mapping_of(u="data.u", y="data.y", time={"step": "data.Ts"})
 
 
+def simulink(folder):
+    path = folder / "out.mat"
+    u, y = record().to_numpy().T
+    out = {"u": u[None, None], "y": y[None, :, None], "Ts": STEP}
+    scipy.io.savemat(path, {"out": out})
+    return path, mapping_of(u="out.u", y="out.y", time={"step": "out.Ts"})
+
+
+def archive(folder):
+    path = folder / "out.npz"
+    u, y = record().to_numpy().T
+    np.savez(path, u=u[None, None], y=y[None, :, None], Ts=STEP)
+    return path, mapping_of(time={"step": "Ts"})
+
+
 def tabs(folder):
     path = folder / "tank.txt"
     table = record()
@@ -130,6 +145,8 @@ RECORDS = [
     side_by_side,
     matlab,
     matlab_structure,
+    simulink,
+    archive,
     tabs,
     comments,
     fixed_width,
@@ -266,6 +283,17 @@ def test_matlab_files_that_hold_no_columns_say_why(tmp_path):
     (tmp_path / "cut.mat").write_bytes((tmp_path / "text.mat").read_bytes()[:150])
     with pytest.raises(DataError, match="cut.mat: cannot be read"):
         read_file(tmp_path / "cut.mat")
+
+
+def test_objects_of_matlab_are_named_with_a_way_out(tmp_path, monkeypatch):
+    scipy.io.savemat(tmp_path / "out.mat", {"y": np.arange(9.0)})
+    fields = [(name, object) for name in ("s0", "s1", "s2", "arr")]
+    opaque = np.array([(b"simout", b"MCOS", b"timeseries", None)], dtype=fields)
+    monkeypatch.setattr(
+        scipy.io, "loadmat", lambda path: {"None": opaque, "y": np.ones((9, 1))}
+    )
+    (finding,) = read_file(tmp_path / "out.mat").findings
+    assert "simout (a timeseries object of MATLAB: save its numbers" in finding.text
 
 
 @pytest.mark.parametrize("is_installed", [True, False])

@@ -382,6 +382,7 @@ SIGNALS = {"states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
         ("Zeit [ms],x,u\n", {"time": 1, **SIGNALS}, 0.02),
         ("Zeit/ms,x,u\n", {"time": 1, **SIGNALS}, 0.02),
         ("t,x,u\nmsec,m,N\n", {"time": "t", **SIGNALS}, 0.02),
+        ("Zeit,x,u\nms,\N{DEGREE SIGN}C,l/min\n", {"time": "Zeit", **SIGNALS}, 0.02),
         ("t,x,u\nns,m,N\n", {"time": "t", **SIGNALS}, 20e-9),
         ("Time [\N{MICRO SIGN}s],x,u\n", {"time": 1, **SIGNALS}, 20e-6),
         ("elapsed (microseconds),x,u\n", {"time": 1, **SIGNALS}, 20e-6),
