@@ -31,6 +31,10 @@ _TORCH = {  # where torch calls the same function otherwise
 }
 _RULE = "must be written with torch, which follows its own functions alone"
 _OTHERWISE = "or as a CasADi function"
+_OTHERWISE_MODEL = (  # of which torch asks nothing, where it has derivatives of its own
+    "or have a linearize() and be planned with by Linearization() and "
+    "covariance='zero_order'"
+)
 _OF_SYSTEMS = (  # functions of ``gpmpc.systems``, called as in math
     *("sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sinh", "cosh", "tanh"),
     *("exp", "log", "sqrt", "abs", "min", "max", "where"),
@@ -163,7 +167,8 @@ def _check_followed(
         if bool((is_number & (part != moved[name])).any()):
             lost = "its values change, and their derivatives are lost"
             ways = "by numpy, math, torch.tensor, .detach() or .item()"
-            raise SettingError(key, f"{_RULE}: {lost} ({ways}), {_OTHERWISE}")
+            otherwise = _OTHERWISE_MODEL if key == "model" else _OTHERWISE
+            raise SettingError(key, f"{_RULE}: {lost} ({ways}), {otherwise}")
 
 
 def _tensors_in(value: Any) -> dict[str, Tensor]:

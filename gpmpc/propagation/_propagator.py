@@ -87,7 +87,8 @@ class Propagator(Protocol):
     then take these themselves.
     ``diagonal``: it computes only the diagonal of the predicted covariance.
     ``process_noise``: it adds the model's noise covariance to the predicted one;
-    controllers that predict covariances by themselves then add it too.
+    controllers that predict covariances by themselves then add it too, and a
+    ``KalmanFilter`` takes no other.
 
     See Also:
         ``gpmpc.testing.check_propagator``, which tells what one of one's own
