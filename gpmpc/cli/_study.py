@@ -5,7 +5,7 @@
 The same command goes on where it stopped.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -24,7 +24,13 @@ from gpmpc.cli._plain_settings import plain_data, plain_settings
 from gpmpc.cli._terminal import logging_console, progress_bar
 from gpmpc.exceptions import SettingError
 from gpmpc.studies._document import json_text, terminal
-from gpmpc.studies.study import Study, TrialSpec, TrialStore, run_study
+from gpmpc.studies.study import (
+    Study,
+    TrialSpec,
+    TrialStore,
+    is_failed,
+    run_study,
+)
 
 # Settings of which one option is chosen, and those of which several may be.
 _ONE = ("data", "excited", "undithered", "model", "flying")
@@ -46,29 +52,49 @@ def study(config: DictConfig) -> Result:
     }
     document = published.document(records)
     origin = {"Made by": json_text(meta).splitlines()}
-    document = replace(document, code={**document.code, **origin})
+    ends = [
+        (trial, record)
+        for trial, record in zip(trials, records, strict=True)
+        if "error" in record
+    ]
+    failures = [
+        _line_of(trial, record, "failed") for trial, record in ends if is_failed(record)
+    ]
+    document = replace(
+        document,
+        code={**document.code, **origin},
+        lists={**document.lists, "Failed, and no results": failures},
+    )
     files = document.files(published.name)
     files[f"{published.name}.json"] = json_text(data)
     files["config.yaml"] = OmegaConf.to_yaml(config, resolve=True)
     written = write_files(folder, files)
     tables, notes = published.summary(records)
     console.print(terminal(tables, *notes))
-    failed = [
-        (trial, record)
-        for trial, record in zip(trials, records, strict=True)
-        if "error" in record
-    ]
     word = "lost" if published.lost_is_result else "failed"
     lines = [f"\n{written}"]
-    for trial, record in failed[:_SHOWN_ERRORS]:
-        labels = ", ".join(f"{key} {value}" for key, value in trial.labels.items())
-        lines.append(f"{word}: {labels}: {record['error']}")
-    if len(failed) > _SHOWN_ERRORS:
-        lines.append(f"{word}: {len(failed) - _SHOWN_ERRORS} more; see {folder}")
+    # Failures first: they are no results, and those that are may be many.
+    ends.sort(key=lambda end: not is_failed(end[1]))
+    lines += [_line_of(*end, word) for end in ends[:_SHOWN_ERRORS]]
+    if len(ends) > _SHOWN_ERRORS:
+        lines.append(f"{word}: {len(ends) - _SHOWN_ERRORS} more; see {folder}")
+    if failures:
+        lines.append(
+            f"{len(failures)} of {len(records)} trials failed and are in no number; "
+            "the same command runs them again"
+        )
     console.out(*lines, sep="\n", highlight=False)
-    all_failed = len(failed) == len(records)
-    failed_as_a_whole = bool(failed) and (all_failed or not published.lost_is_result)
-    return Result(data | {"folder": str(folder)}, 1 if failed_as_a_whole else 0)
+    all_ended = len(ends) == len(records)
+    is_incomplete = bool(ends) and (all_ended or not published.lost_is_result)
+    code = 1 if failures or is_incomplete else 0
+    return Result(data | {"folder": str(folder)}, code)
+
+
+def _line_of(trial: TrialSpec, record: Mapping[str, Any], word: str) -> str:
+    """Returns why a trial has no numbers, which ``word`` says unless it failed."""
+    labels = ", ".join(f"{key} {value}" for key, value in trial.labels.items())
+    word = "failed" if is_failed(record) else word
+    return f"{word}: {labels}: {record['error']}"
 
 
 # ``_main`` calls the function of the command's name.
@@ -109,15 +135,15 @@ def _run_trials(
         trials = published.trials(folder)
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-            store = TrialStore(folder / "trials.jsonl")
             progress.update(task, description=published.name, total=len(trials))
-            records = run_study(
-                published.run_trial,
-                trials,
-                store,
-                workers=published.workers,
-                progress=lambda record: progress.advance(task),
-            )
+            with TrialStore.held(folder / "trials.jsonl") as store:
+                records = run_study(
+                    published.run_trial,
+                    trials,
+                    store,
+                    workers=published.workers,
+                    progress=lambda record: progress.advance(task),
+                )
     return trials, records
 
 

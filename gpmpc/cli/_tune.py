@@ -10,7 +10,7 @@ command proposes the same candidates, and those that are finished are not flown 
 import math
 from argparse import Namespace
 from collections.abc import Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from typing import Any, cast
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -28,7 +28,13 @@ from gpmpc.cli._overrides import choices, is_shared
 from gpmpc.cli._settings import config_source_options, run_command, without_hydra
 from gpmpc.cli._sweep import JobOutcome, Sweep, cannot_go_on, print_failed
 from gpmpc.cli._terminal import print_error
-from gpmpc.exceptions import DataError, GpmpcError, SettingError, check_number
+from gpmpc.exceptions import (
+    DataError,
+    GpmpcError,
+    RecordingError,
+    SettingError,
+    check_number,
+)
 from gpmpc.metrics import tracking_cost
 from gpmpc.recording import read_run
 from gpmpc.studies._document import terminal
@@ -54,8 +60,8 @@ class Tuning:
         self.base = without_hydra(runs.config)
         #: all that were flown, or are being flown
         self.jobs: list[Job] = []
-        #: flights of this call that failed, and why
-        self.failed: list[JobOutcome] = []
+        #: flights of this call that failed, and why, by folder
+        self.failures: dict[str, JobOutcome] = {}
         _check_base(self.base)
         # The cost has the weights of this controller, whatever is searched.
         self._controller: Any = experiment_of(self.base).controller
@@ -87,12 +93,37 @@ class Tuning:
         batch = [*by_folder.values()]
         self.runs.check(batch)
         self.jobs.extend(batch)
-        outcomes = self.runs.fly(batch)
-        self.failed += [each for each in outcomes if each.error is not None]
+        for outcome in self.runs.fly(batch):
+            # A candidate may come twice, and fly again where it failed.
+            self.failures.pop(outcome.folder, None)
+            if outcome.error is not None:
+                self.failures[outcome.folder] = outcome
+        cost_of = {path: self._cost(job) for path, job in by_folder.items()}
         return [
-            sum(_cost(job, self._controller.keywords) for job in jobs) / self.seeds
+            sum(cost_of[job.folder.path] for job in jobs) / self.seeds
             for jobs in jobs_of_candidates
         ]
+
+    @property
+    def failed(self) -> list[JobOutcome]:
+        """The flights of this call that failed, and why."""
+        return [*self.failures.values()]
+
+    def _cost(self, job: Job) -> float:
+        """Returns the cost of a flight, infinite where it was lost or failed.
+
+        One whose recording is gone or damaged has failed: who removes its folder has it
+        flown again.
+        """
+        folder = str(job.folder.path)
+        if folder in self.failures:
+            return math.inf
+        try:
+            return _cost(job, self._controller.keywords)
+        except (DataError, RecordingError) as error:
+            reason = f"{error}; its folder has to be removed to fly it again"
+            self.failures[folder] = JobOutcome(folder, reason)
+            return math.inf
 
     def _jobs(self, candidate: Candidate) -> list[Job]:
         """Returns the flights of a candidate, one a seed."""
@@ -126,6 +157,9 @@ def tune(arguments: Namespace) -> Result:
                 candidates = search.ask(min(arguments.batch, arguments.trials - start))
                 search.tell(tuning.costs(candidates))
                 describe(f"flying; least cost {search.costs[search.best]:.4g}")
+    except OSError as error:
+        place = error.filename or runs.tree
+        return cannot_go_on(runs.tree, f"{place}: {error.strerror or error}")
     except Refused as error:
         is_first_batch = len(tuning.jobs) <= tuning.seeds
         if is_first_batch and not error.has_launched:
@@ -173,12 +207,23 @@ def _check_base(base: DictConfig) -> None:
             "recorder",
             f"must be mcap: a flight's cost is read from it; got {base.recorder}",
         )
-    if base.steps < 2:
-        raise SettingError(
-            "steps",
-            "must be 2 or more: the cost counts from the second state on; "
-            f"got {base.steps}",
-        )
+    _check_least_steps("steps", [base.steps])
+
+
+def _check_least_steps(key: str, values: Sequence[Any]) -> None:
+    """Raises where a flight of some number of steps would have no cost."""
+    if key.lstrip("+") != "steps":
+        return
+    for value in values:
+        steps = math.inf
+        with suppress(ValueError, TypeError):  # what is no number, a flight refuses
+            steps = float(value)
+        if steps < 2:
+            raise SettingError(
+                "steps",
+                "must be 2 or more: the cost counts from the second state on; "
+                f"got {value}",
+            )
 
 
 def _space(
@@ -192,14 +237,21 @@ def _space(
         if not override.is_sweep_override():
             fixed.append(str(override.input_line))
             continue
+        if key == "recorder":
+            raise SettingError(
+                key, "cannot be searched: a flight's cost is read from its recording"
+            )
         if key == "seed" or is_shared(key):
             raise SettingError(key, "cannot be searched; seeds are many by --seeds")
         if override.is_interval_sweep():
-            space[key] = _interval(key, override)
+            interval = _interval(key, override)
+            _check_least_steps(key, [interval.low])
+            space[key] = interval
             continue
         values = [*override.sweep_string_iterator()]
         if not values:
             raise SettingError(key, "holds no value to search")
+        _check_least_steps(key, values)
         space[key] = values
     if not space:
         raise GpmpcError(

@@ -12,6 +12,7 @@ import pandas as pd
 from gpmpc.experiments.figures_drawing import LOOP_TITLES, draw_all
 from gpmpc.metrics import binomial_interval, time_quantiles
 from gpmpc.studies._document import MISSING, Document, Table, number
+from gpmpc.studies.study import is_lost
 
 LEGEND = (
     "RMSE: of the positions [m] (attitude: roll, pitch, yaw [rad]) over all steps and "
@@ -102,7 +103,8 @@ def summarise(records: Sequence[dict]) -> pd.DataFrame:
 def _pooled(records: list[dict]) -> dict[str, Any]:
     """Returns the numbers of one row; None for those that it does not have."""
     good = [record for record in records if "error" not in record]
-    numbers: dict[str, Any] = {"trials": len(good), "lost": len(records) - len(good)}
+    losses = sum(map(is_lost, records))
+    numbers: dict[str, Any] = {"trials": len(good), "lost": losses}
     numbers |= dict.fromkeys(NUMBERS)
     if not good:
         return numbers

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from gpmpc.exceptions import GpmpcError, SettingError, check_number
+from gpmpc.exceptions import SettingError, check_number
 from gpmpc.experiments.quality_figure import front_figure
 from gpmpc.gaussian import Gaussian
 from gpmpc.metrics import tracking_cost, tracking_error
@@ -33,7 +33,14 @@ from gpmpc.plotting import png
 from gpmpc.simulation import Rollout
 from gpmpc.studies._document import MISSING, Document, Table, number
 from gpmpc.studies.flight import Experiment, run_trial
-from gpmpc.studies.study import TrialSpec, fingerprint, read_model, trained_model
+from gpmpc.studies.study import (
+    LostFlight,
+    TrialSpec,
+    fingerprint,
+    is_failed,
+    read_model,
+    trained_model,
+)
 from gpmpc.trajectories import Trajectory
 
 #: [m] from the reference, some hundred times what is usual: no costs to compare
@@ -76,6 +83,7 @@ EXACT = "propagation=moment_matching"
 POINTS = "propagation=unscented"
 MORE = "controller.iterations=100 controller.tolerance=1e-6"
 FIRST_ORDER = "propagation=linearization"
+_FAILED = "failed: "  # before why a flight failed that was not lost
 FAMILIES = (
     TRUTH,
     Family("LQR", "controller=lqr"),
@@ -246,7 +254,7 @@ class Quality:
         """Flies one trial.
 
         Raises:
-            GpmpcError: The vehicle has left its path.
+            LostFlight: The vehicle has left its path.
         """
         experiment, file = trial.condition
         model = None if file is None else read_model(file)
@@ -407,12 +415,12 @@ class TimedOnPlant:
 
 
 def _check_on_path(rollout: Rollout, axes: Sequence[int]) -> None:
-    """Raises ``GpmpcError`` if a vehicle was farther off its path than ``LOST``."""
+    """Raises ``LostFlight`` if a vehicle was farther off its path than ``LOST``."""
     errors = (rollout.states - rollout.references)[:, axes]
     near = np.linalg.norm(errors, axis=1) <= LOST  # not where it is NaN
     if not near.all():
         step = int(np.argmax(~near))
-        raise GpmpcError(f"{LOST:g} m off its path after {step} steps")
+        raise LostFlight(f"{LOST:g} m off its path after {step} steps")
 
 
 def pareto_front(
@@ -487,7 +495,8 @@ def _first_error(records: Iterable[Mapping[str, Any]]) -> str | None:
     """Says which of the flights was lost first, and how; None if none was."""
     for record in records:
         if "error" in record:
-            return f"{record['trajectory']}, seed {record['seed']}: {record['error']}"
+            text = f"{record['trajectory']}, seed {record['seed']}: {record['error']}"
+            return f"{_FAILED}{text}" if is_failed(record) else text
     return None
 
 
@@ -514,7 +523,8 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> Table:
                 str(row["failed"]),
             ]
         else:
-            cells = ["lost", MISSING, MISSING, MISSING]
+            word = "failed" if _FAILED in row["lost"] else "lost"
+            cells = [word, MISSING, MISSING, MISSING]
         mark = "●" if row["front"] else ""
         lines.append([row["what"], str(row["H"]), *cells, mark])
     header = ["gpmpc run", "H", "cost", "ms: median", "99 %", "failed", "front"]

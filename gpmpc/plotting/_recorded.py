@@ -437,7 +437,7 @@ def _mark_failures(run: "Run", *axes: Axes) -> None:
                 color=ORANGE,
                 linewidth=1,
                 alpha=0.6,
-                label="failed solve",
+                label="failed decision",
                 zorder=0,
             )
 

@@ -20,6 +20,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from filelock import lock_descriptor
 from threadpoolctl import threadpool_limits
 
 from gpmpc._compiling import report_compilation
@@ -40,10 +41,16 @@ from gpmpc.studies._document import Document, Table
 
 __all__ = ["Study", "TrialSpec", "TrialStore", "run_study"]
 
+
+class LostFlight(GpmpcError):
+    """A flight went so far astray that its numbers say nothing: a result, too."""
+
+
 _LinAlgError = torch.linalg.LinAlgError  # pyright: ignore[reportPrivateImportUsage]
 # Errors that settings, data and code alone decide: they come again.
 _RESULTS = (
     Diverged,
+    LostFlight,
     ProblemError,
     SolverFailure,
     TrainingError,
@@ -113,7 +120,8 @@ def run_study(
         run_trial: From a trial to plain data. What it raises as a ``GpmpcError``, or of
             linear algebra, is the trial's ``error``; the others go on. One that its
             settings and code decide is kept; a trial that failed for another reason,
-            such as a full disk or a library that is missing, is run again next time.
+            such as a full disk or a library that is missing, is run again next time,
+            and ``is_result`` of its record is false.
         trials: All of the study.
         store: Where records are kept.
         workers: Processes; None takes one a core.
@@ -140,6 +148,7 @@ def run_study(
                 if is_result:
                     store.append(jobs[index].fingerprint, record)
                 else:
+                    record["is_result"] = False
                     not_kept[jobs[index].fingerprint] = record
                 progress(record)
     except BrokenProcessPool as error:
@@ -149,6 +158,16 @@ def run_study(
         ) from error
     records = store.records | not_kept
     return [records[trial.fingerprint] | dict(trial.labels) for trial in trials]
+
+
+def is_lost(record: Mapping[str, Any]) -> bool:
+    """Whether a trial was lost by what it tries, which is a result."""
+    return "error" in record and not is_failed(record)
+
+
+def is_failed(record: Mapping[str, Any]) -> bool:
+    """Whether a trial failed by its surroundings, which is no result."""
+    return not record.get("is_result", True)
 
 
 @report_compilation()
@@ -171,7 +190,8 @@ def _run_in_worker(
 class TrialStore:
     """Records of finished trials, in a file of one JSON object a line.
 
-    A line that a crash cut short is skipped.
+    A line that a crash cut short is skipped. Who appends holds the store: two processes
+    would run each trial twice, and disturb each other's times.
 
     Args:
         path: The file; the first ``append`` makes it.
@@ -189,6 +209,25 @@ class TrialStore:
                 entry = json.loads(line)
                 self.records[entry["fingerprint"]] = entry["record"]
         self._cut_short = text != "" and not text.endswith("\n")
+
+    @staticmethod
+    @contextmanager
+    def held(path: Path) -> Iterator["TrialStore"]:
+        """Opens a store for one process alone.
+
+        Raises:
+            GpmpcError: Another process holds it.
+        """
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            if not lock_descriptor(file, blocking=False):
+                raise GpmpcError(
+                    f"{path}: another process runs these trials; wait for its end, or "
+                    "choose another folder"
+                )
+            yield TrialStore(path)
+        finally:
+            os.close(file)
 
     def append(self, fingerprint: str, record: dict) -> None:
         """Keeps a record; it is on the disk when this returns."""

@@ -1,5 +1,6 @@
 """``gpmpc tune`` as a user meets it: the best command, resumption, clear mistakes."""
 
+import errno
 import json
 import math
 import re
@@ -135,6 +136,8 @@ def test_flights_that_failed_are_told_and_cost_no_number(
         (["seed=1,2"], "seed: cannot be searched; seeds are many by --seeds"),
         (["horizon=1,2", "recorder=none"], "recorder: must be mcap"),
         (["horizon=1,2", "steps=1"], "steps: must be 2 or more"),
+        (["steps=1,50"], "steps: must be 2 or more"),
+        (["recorder=mcap,none"], "recorder: cannot be searched"),
         (
             ["controller.tolerance=interval(2,1)"],
             "controller.tolerance: must rise; got",
@@ -160,6 +163,56 @@ def test_a_mistake_is_one_clear_line(arguments, message, tmp_path):
     assert done.returncode == 2
     assert message in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_a_flight_without_a_cost_is_told_and_ends_no_search(tmp_path, monkeypatch):
+    with settings_folders():
+        runs = Sweep("tune", [f"folder={tmp_path}"], Console(quiet=True))
+        tuning = Tuning(runs, [f"folder={tmp_path}"], seeds=1)
+        outcomes = []
+        monkeypatch.setattr(runs, "check", lambda jobs: None)
+        monkeypatch.setattr(
+            runs, "fly", lambda jobs: [outcomes.pop(0)(job) for job in jobs]
+        )
+
+        def ends(error):
+            return lambda job: JobOutcome(str(job.folder.path), error)
+
+        def no_recording(job, controller):
+            raise DataError("run.mcap: 5 of 20 steps are lost")
+
+        monkeypatch.setattr(_tune, "_cost", lambda job, controller: 1.0)
+        outcomes += [ends("its process died"), ends(None)]
+        assert tuning.costs([{"horizon": 2}, {"horizon": 3}]) == [math.inf, 1.0]
+        (failed,) = tuning.failed
+        assert failed.error == "its process died"
+        outcomes += [ends(None)]  # proposed again, and finished now
+        assert tuning.costs([{"horizon": 2}]) == [1.0]
+        assert tuning.failed == []
+        monkeypatch.setattr(_tune, "_cost", no_recording)
+        outcomes += [ends(None)]
+        assert tuning.costs([{"horizon": 4}]) == [math.inf]
+        (failed,) = tuning.failed
+        assert "5 of 20 steps are lost; its folder has to be removed" in failed.error
+
+
+def test_a_full_disk_ends_a_search_that_goes_on_later(tmp_path, monkeypatch, capsys):
+    def fly(sweep, jobs):
+        raise OSError(errno.ENOSPC, "No space left on device", str(tmp_path))
+
+    monkeypatch.setattr(Sweep, "fly", fly)
+    arguments = Namespace(
+        config_name="tune",
+        overrides=[*TINY, "horizon=2,3", f"folder={tmp_path}"],
+        trials=1,
+        batch=1,
+        seeds=1,
+    )
+    with settings_folders():
+        assert _tune.tune(arguments).code == 1
+    said = capsys.readouterr().err
+    assert f"{tmp_path}: No space left on device; the sweep ended before" in said
+    assert "the same command goes on where it stopped" in said
 
 
 def test_the_help_of_tune_can_be_typed(tmp_path):

@@ -137,6 +137,8 @@ def rows(tmp_path_factory):
     records = run_study(
         study.run_trial, trials, TrialStore(folder / "trials.jsonl"), workers=1
     )
+    # A lost flight is a result, which is kept like any other.
+    assert len(TrialStore(folder / "trials.jsonl").records) == 12
     document = study.document(records)
     assert document.images["quality.png"].startswith(b"\x89PNG")
     assert "controller=convex horizon=2: elliptical, seed 0: " in document.markdown()

@@ -627,6 +627,26 @@ def test_a_state_that_never_moves_is_drawn(recwarn):
     assert not recwarn.list
 
 
+def test_intervals_are_shown_however_wrong_they_are():
+    errors = np.ones((2, 1))
+    coverage = np.array([[0.3], [np.nan]])
+    width = np.array([[4.0], [np.nan]])
+    judgement = Judgement(
+        groups=("pressure",),
+        units=("Pa",),
+        steps=(1, 10),
+        mean={"model": errors, "constant state": errors},
+        rmse={"model": errors, "constant state": errors},
+        coverage=coverage,
+        coverage_interval=np.stack([coverage - 0.1, coverage + 0.1], axis=-1),
+        width=width,
+        windows=20,
+    )
+    low, high = judgement_figure(judgement).axes[1].get_ylim()
+    assert low < 0.2
+    assert high > 4
+
+
 def test_one_stretch_tells_no_average_from_chance():
     """Its errors are least where two corrections are averaged."""
     errors = np.full((len(_PRIORS), 20, 1), 2.0)

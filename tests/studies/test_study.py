@@ -13,6 +13,8 @@ import torch
 from threadpoolctl import threadpool_info
 
 from gpmpc.exceptions import GpmpcError, SettingError, TrainingError
+from gpmpc.experiments.figures_tables import _pooled
+from gpmpc.experiments.quality import _first_error
 from gpmpc.gp import Trainer, Transitions
 from gpmpc.studies import study as studied
 from gpmpc.studies.study import (
@@ -20,6 +22,8 @@ from gpmpc.studies.study import (
     TrialStore,
     derived_seed,
     fingerprint,
+    is_failed,
+    is_lost,
     one_thread,
     random_rows,
     read_model,
@@ -48,6 +52,17 @@ def test_a_store_finds_records_behind_a_line_cut_short(tmp_path):
     torn.append("e", {"error": 5})
     assert [line[:6] for line in path.read_text().splitlines()][-3:] == ['{"fing'] * 3
     assert [*TrialStore(path).records] == [*torn.records] == ["a", "b", "d", "e"]
+
+
+def test_a_store_is_of_one_process(tmp_path):
+    path = tmp_path / "trials.jsonl"
+    with TrialStore.held(path) as store:
+        store.append("a", {})
+        message = f"{path}: another process runs these trials; wait"
+        with pytest.raises(GpmpcError, match=message), TrialStore.held(path):
+            pass
+    with TrialStore.held(path) as store:
+        assert [*store.records] == ["a"]
 
 
 def test_a_record_is_on_the_disk_when_it_is_kept(tmp_path, monkeypatch):
@@ -120,6 +135,12 @@ def test_a_trial_that_failed_by_its_surroundings_is_run_again(tmp_path, started)
         store = TrialStore(tmp_path / "trials.jsonl")
         (record,) = run_study(fail, trials, store, 1)
         assert "needs a library" in record["error"]
+        assert is_failed(record)
+        assert not is_lost(record)
+        # No flight that was lost: a row of published figures counts none.
+        row = _pooled([record, {"error": "diverged"}])
+        assert (row["trials"], row["lost"]) == (0, 1)
+        assert _first_error([record | {"trajectory": "lorenz"}]).startswith("failed: ")
     assert len(started) == 2
 
 
