@@ -394,6 +394,7 @@ def _continue(fields: Any, previous: Decision) -> None:
         ctypes.memmove(ctypes.byref(fields), memory, ctypes.sizeof(fields))
     elif fits and previous.solution is not None:
         _write_solution(fields.solution, previous.solution)
+    # a policy may have moved the plan since the memory was kept
     view(fields.input)[:] = previous.input
     estimate = previous.disturbance
     if estimate is None or np.shape(estimate) != np.shape(fields.disturbance):

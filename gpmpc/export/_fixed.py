@@ -9,8 +9,9 @@ from gpmpc.export._text import Numbers, integers
 from gpmpc.gp import GPPosterior
 
 _LOG2_E = 1.0 / np.log(2.0)
-# bits of a sum of squares that are left for u: beyond, whole numbers do not reach
-_LEAST_BITS = 9
+# A sum of squares is scaled to 32 bits, by ``bits``, which with the 31 of a square are
+# moved to the 40 of u: by ``bits - 9`` to the right, so that fewer do not reach.
+_LEAST_BITS = 40 - 31
 _MOST_BITS = 60
 # Of the magnitudes of weights: a smaller one is none, as of an output whose targets are
 # all its prior mean. Its unit, and a whole number's part of that, would be infinite.

@@ -103,7 +103,7 @@ def _questions_by_step(rollout: Rollout, witness: _Witness) -> list[Question]:
         rule = "must fly the controller that it is handed"
         got = f"it was asked {len(asked)} times in {known} steps"
         raise SettingError("fly", f"{rule}; {got} whose measurement was not lost")
-    # a rehearsal (``gpmpc.simulation.rehearse``) asks before the first step
+    # a rehearsal, ``gpmpc.simulation.rehearse``, asks before the first step
     in_flight = iter(asked[len(asked) - known :])
     first = asked[len(asked) - known]
     question = first._replace(measured=np.full_like(first.measured, np.nan))

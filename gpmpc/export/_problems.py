@@ -26,9 +26,9 @@ _COMMENTS = {
     "GPMPC_ROWS": "rows of the states' constraints at a stage, r",
     "GPMPC_PARAMETERS": "of outputs and inequalities, q",
     "GPMPC_ITERATIONS": "changes of the working set; 0: 100 + 10 per constraint",
-    "GPMPC_POINTS": "of the GPs, N",
-    "GPMPC_DIFFERENCES": "of a state from the points, d N",
-    "GPMPC_KERNELS": "of a state that are kept for variances, k N",
+    "GPMPC_POINTS": "of the GPs",
+    "GPMPC_DIFFERENCES": "of a state from the points, d features of each",
+    "GPMPC_KERNELS": "of a state that are kept for variances, k of each point",
     "GPMPC_GP_OUTPUTS": "k",
     "GPMPC_PENALIZED": "what R weighs: 0 inputs, 1 deviations, 2 increments",
     "GPMPC_TOLERANCE": "of a solution, as a share of its size",
@@ -90,8 +90,9 @@ def tightens(controller: GPMPC) -> bool:
 
 
 def needs_means_alone(controller: GPMPC) -> bool:
-    """Returns whether the model is asked for a mean without its derivatives.
+    """Returns whether the model is asked for a mean without its derivatives, too.
 
+    The code that writes both is then also called where A is NULL, and leaves these out.
     It is where plans are rolled out, and where a disturbance is estimated.
     """
     prediction = controller.prediction

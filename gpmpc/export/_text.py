@@ -105,7 +105,8 @@ def needed_parts(text: str, flags: Mapping[str, int]) -> str:
     """Returns code of C without what flags exclude: ``#if`` of these is decided here.
 
     Args:
-        text: With conditions such as ``#if A || !B``; others stay as they are.
+        text: With conditions such as ``#if A || !B``; others, such as ``A && B``, stay
+            as they are, for the compiler.
         flags: Values by name.
     """
     lines = []

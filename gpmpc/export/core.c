@@ -464,7 +464,7 @@ static void follow_inputs(gpmpc_controller *controller)
 #if GPMPC_HELD
 /* Shares what the plan, moved by full turns (n), did not foresee out over the steps
    of the policy. */
-static void share_increments(gpmpc_controller *controller, const real *turns)
+static void share_step_model(gpmpc_controller *controller, const real *turns)
 {
     gpmpc_problem *problem = &controller->problem;
     const int planned = H > 1 ? 2 : 1; /* a plan of one stage is used up */
@@ -489,9 +489,9 @@ static void share_increments(gpmpc_controller *controller, const real *turns)
     }
 }
 
-/* The held linearisation as that of the increments since the last step:
+/* The held linearisation as that of the changes since the last step:
    c = s_0 - A s_{-1} - B u_{-1}, in which a constant error of the model cancels. */
-static void write_increments(gpmpc_controller *controller)
+static void write_step_model(gpmpc_controller *controller)
 {
     gpmpc_problem *problem = &controller->problem;
     real last[GPMPC_STATES];
@@ -508,7 +508,7 @@ static void write_increments(gpmpc_controller *controller)
         write_offset(problem, 0, i, problem->states[0][i], last,
                      problem->previous_input);
     if (controller->policy_steps > 0)
-        share_increments(controller, turns);
+        share_step_model(controller, turns);
 }
 #endif
 
@@ -554,7 +554,8 @@ static void riccati(const real *A, const real *B, const real *Q, const real *R,
 }
 
 #if GPMPC_TUBES || GPMPC_ROLLS_OUT || GPMPC_ELASTIC
-/* Gains K_k of u = u_k - K_k (x - x_k), the regulator of the plan's own stages. */
+/* Gains K_k of u = u_k - K_k (x - x_k), the regulator of the plan's own stages, weighed
+   by Q and R of the first one, and by the terminal weight. */
 static void write_gains(gpmpc_problem *problem)
 {
     real P[GPMPC_STATES * GPMPC_STATES];
@@ -1479,7 +1480,8 @@ static void solve_free(gpmpc_controller *controller, const elastic_rows *rows)
     for (e = 0; e < r; e++)
         if (rows->gives_way[e])
             problem->prices[e] = GPMPC_NO_PRICE * row_prices[e];
-    solve(problem, &controller->program, &controller->candidate, &controller->elastic);
+    solve(problem, &controller->program, &controller->candidate,
+          &controller->trial_solution);
 }
 
 static void restore_exact_prices(gpmpc_problem *problem)
@@ -1509,7 +1511,7 @@ static void solve_cheaper(gpmpc_controller *controller, const elastic_rows *rows
 {
     gpmpc_problem *problem = &controller->problem;
     gpmpc_solution *solution = &controller->candidate;
-    gpmpc_solution *cheaper = &controller->elastic;
+    gpmpc_solution *cheaper = &controller->trial_solution;
     lower_prices(problem, rows, price);
     solve(problem, &controller->program, solution, cheaper);
     if (cheaper->status == GPMPC_SOLVED)
@@ -1527,7 +1529,7 @@ static void solve_at_highest_price(gpmpc_controller *controller,
 {
     gpmpc_problem *problem = &controller->problem;
     gpmpc_solution *solution = &controller->candidate;
-    gpmpc_solution *trial = &controller->elastic;
+    gpmpc_solution *trial = &controller->trial_solution;
     real affordable_price = limits.lowest_trial_price;
     real unaffordable_price = limits.exact_price;
     int is_affordable = 0;
@@ -1556,12 +1558,13 @@ static void solve_at_highest_price(gpmpc_controller *controller,
 }
 
 /* Replaces a solution that misses an elastic row by the one under the price that the
-   row is worth. */
+   row is worth. Every program that is tried leaves its solution in the same place: that
+   of free rows is read before the next one. */
 static void solve_elastic(gpmpc_controller *controller)
 {
     gpmpc_problem *problem = &controller->problem;
     gpmpc_solution *solution = &controller->candidate;
-    gpmpc_solution *free_solution = &controller->elastic;
+    gpmpc_solution *free_solution = &controller->trial_solution;
     elastic_rows rows;
     elastic_limits limits;
     real misses[GPMPC_STATE_ROWS];
@@ -1728,7 +1731,7 @@ static int write_local_problem(gpmpc_controller *controller, const real *covaria
 #endif
 #if GPMPC_HELD
     if (controller->has_plan && !is_used_up(controller))
-        write_increments(controller);
+        write_step_model(controller);
 #endif
     return write_rows(problem, reference);
 }

@@ -174,7 +174,7 @@ typedef struct {
 #endif
     /* of the program in feedback coordinates: u_k = F_k [s_k; u_{k-1}; 1] + v_k */
     int has_feedback;
-    int is_unstable; /* whether roll-outs follow that feedback, too */
+    int is_unstable; /* has_feedback by the limit of doubles: roll-outs follow it, too */
     gpmpc_real feedback[GPMPC_HORIZON][GPMPC_INPUTS][GPMPC_AUGMENTED];
     gpmpc_real hessians[GPMPC_HORIZON][GPMPC_INPUTS][GPMPC_INPUTS];
     /* of condensing */
@@ -214,7 +214,7 @@ typedef struct {
     gpmpc_program program;
     gpmpc_solution candidate;
 #if GPMPC_ELASTIC
-    gpmpc_solution elastic; /* under another price of rows that give way */
+    gpmpc_solution trial_solution; /* under another price of rows that give way */
 #endif
 } gpmpc_controller;
 

@@ -19,7 +19,8 @@ typedef struct {
     real shift[GPMPC_MEASURED + GPMPC_STATES]; /* of the means */
     real unit_lower[GPMPC_MEASURED][GPMPC_MEASURED]; /* R = T diag(variance) T' */
     real variance[GPMPC_MEASURED];
-    real negligible[GPMPC_MEASURED]; /* an entry below it is round-off of its row */
+    /* an entry below it is round-off: of its row before any sensor was taken */
+    real negligible[GPMPC_MEASURED];
     real innovation[GPMPC_MEASURED];
     int is_missing[GPMPC_MEASURED];
 } gpmpc_update;

@@ -25,7 +25,8 @@ static const uint64_t ONE = (uint64_t)1 << 40; /* 1 in 40 bits */
 static const uint32_t DECAY[8] = {
     4186u, 63221u, 659694u, 5725852u, 41309332u, 238388304u, 1031764990u, 2977044472u};
 
-/* 2^-u of 40 bits, below 1 */
+/* 2^-u, below 1; both in 40 bits after the point. ``lost`` is 1 - 2^-f of the fraction f
+   in 64 bits; the whole part of u shifts 2^-f to the right. */
 static uint64_t decayed(uint64_t u)
 {
     uint64_t f = u & (ONE - 1);

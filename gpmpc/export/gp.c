@@ -130,7 +130,7 @@ typedef struct gp_fixed_tables gp_fixed_tables;
 
 /* k GPs over the same N points of d features. */
 typedef struct {
-    int points;             /* N */
+    int points;             /* their number N, which is not that of unknowns */
     int features;           /* d */
     int outputs;            /* k */
     const wide *x;          /* the points, feature after feature (d, N) */

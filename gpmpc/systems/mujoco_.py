@@ -95,7 +95,8 @@ class _Joints(_Model):
         """Returns the positions of MuJoCo's joints (nq,) in a state (n,)."""
         count = self.model.nq
         positions = np.empty(count)
-        positions[self._order[:count] - 1] = state[:count]
+        places = self._order[:count] - 1  # without time, which comes first
+        positions[places] = state[:count]
         return positions
 
     def successor(self, x: Any, u: Any) -> Array:

@@ -29,7 +29,7 @@ class RigidBody:
     It knows neither drag nor that the rotors lag.
     """
 
-    mass: float = 0.4  #: [kg]
+    mass: float = 0.4  #: [kg]; less than the model's: that is left to be learned
     #: principal moments of inertia [kg m^2]
     inertia: tuple[float, float, float] = (0.0025, 0.0025, 0.0045)
     arm: float = 0.12  #: from the centre to a rotor, along x and along y [m]
