@@ -12,9 +12,9 @@ static void add_to(real *x, real *low, int i, real change)
     low[i] = sum.low;
 }
 
-static Pair multiplier_of(const gpmpc_program *work, int p)
+static Pair multiplier_of(const gpmpc_program *program, int p)
 {
-    return pair_of(work->multiplier[p], work->multiplier_low[p]);
+    return pair_of(program->multiplier[p], program->multiplier_low[p]);
 }
 
 #if GPMPC_IS_FLOAT
@@ -88,21 +88,21 @@ static Pair exact_row(const gpmpc_problem *problem, const Rollout *rollout, int 
 
 /* Constraint p of a program counts from the solution v = 0: writes its value, given
    that of the inputs or states and the bounds that these have. */
-static void write_exact_value(gpmpc_program *work, int p, Pair value, real low,
+static void write_exact_value(gpmpc_program *program, int p, Pair value, real low,
                               real high)
 {
     if (is_finite(high)) {
         add(&value, -high);
-        add(&value, work->upper[p]);
-        value.low += work->upper_low[p];
+        add(&value, program->upper[p]);
+        value.low += program->upper_low[p];
     } else if (is_finite(low)) {
         add(&value, -low);
-        add(&value, work->lower[p]);
-        value.low += work->lower_low[p];
+        add(&value, program->lower[p]);
+        value.low += program->lower_low[p];
     }
     value = normalised(value);
-    work->value[p] = value.high;
-    work->value_low[p] = value.low;
+    program->value[p] = value.high;
+    program->value_low[p] = value.low;
 }
 
 /* u_k - u_{k-1} of input i. */
@@ -118,7 +118,7 @@ static Pair exact_rate(const gpmpc_problem *problem, const Pair *inputs, int k, 
 
 /* Writes the values of all rows along a rollout. */
 static void write_exact_values(const gpmpc_problem *problem, const Rollout *rollout,
-                               gpmpc_program *work)
+                               gpmpc_program *program)
 {
     int first_rate = problem->has_feedback ? 2 * N : N;
     int first_row = first_rate + GPMPC_RATE_ROWS;
@@ -127,22 +127,22 @@ static void write_exact_values(const gpmpc_problem *problem, const Rollout *roll
         for (i = 0; i < m; i++) {
             int j = k * m + i;
             if (problem->has_feedback)
-                write_exact_value(work, N + j, rollout->inputs[j], input_lower[j],
+                write_exact_value(program, N + j, rollout->inputs[j], input_lower[j],
                                   input_upper[j]);
             if (GPMPC_HAS_RATES)
-                write_exact_value(work, first_rate + j,
+                write_exact_value(program, first_rate + j,
                                   exact_rate(problem, rollout->inputs, k, i),
                                   rate_lower[j], rate_upper[j]);
         }
         for (e = 0; e < r; e++)
-            write_exact_value(work, first_row + k * r + e,
+            write_exact_value(program, first_row + k * r + e,
                               exact_row(problem, rollout, k, e),
                               problem->row_lower[k][e], problem->row_upper[k][e]);
     }
 }
 
 /* slope <- slope + d/du_k of what inputs cost, and of bounds of inputs and rates */
-static void add_input_slope(const gpmpc_problem *problem, const gpmpc_program *work,
+static void add_input_slope(const gpmpc_problem *problem, const gpmpc_program *program,
                             const Pair *inputs, int k, Pair *slope)
 {
     int first_rate = problem->has_feedback ? 2 * N : N;
@@ -164,16 +164,16 @@ static void add_input_slope(const gpmpc_problem *problem, const gpmpc_program *w
     for (i = 0; i < m; i++) {
         int p = k * m + i;
         add_multiple(&slope[i], 1,
-                     multiplier_of(work, problem->has_feedback ? N + p : p));
+                     multiplier_of(program, problem->has_feedback ? N + p : p));
         if (GPMPC_HAS_RATES)
-            add_multiple(&slope[i], 1, multiplier_of(work, first_rate + p));
+            add_multiple(&slope[i], 1, multiplier_of(program, first_rate + p));
         if (GPMPC_HAS_RATES && k + 1 < H)
-            add_multiple(&slope[i], -1, multiplier_of(work, first_rate + p + m));
+            add_multiple(&slope[i], -1, multiplier_of(program, first_rate + p + m));
     }
 }
 
 /* Adds d/ds_{k+1} and d/du_k of what a stage costs, and of its rows. */
-static void add_stage_slopes(const gpmpc_problem *problem, const gpmpc_program *work,
+static void add_stage_slopes(const gpmpc_problem *problem, const gpmpc_program *program,
                              const Rollout *rollout, int k, Pair *by_state,
                              Pair *by_input)
 {
@@ -199,7 +199,7 @@ static void add_stage_slopes(const gpmpc_problem *problem, const gpmpc_program *
     }
 #endif
     for (e = 0; e < r; e++) {
-        Pair multiplier = multiplier_of(work, first_row + e);
+        Pair multiplier = multiplier_of(program, first_row + e);
         if (multiplier.high == 0)
             continue;
         for (i = 0; i < n; i++)
@@ -213,7 +213,7 @@ static void add_stage_slopes(const gpmpc_problem *problem, const gpmpc_program *
 
 /* Writes the gradient of the Lagrangian by v, by the adjoint recursion. */
 static void write_exact_gradient(const gpmpc_problem *problem, const Rollout *rollout,
-                                 gpmpc_program *work)
+                                 gpmpc_program *program)
 {
     Pair costate[GPMPC_STATES + GPMPC_INPUTS]; /* by s_{k+1}, and by u_k through F */
     int k, i, j;
@@ -223,8 +223,8 @@ static void write_exact_gradient(const gpmpc_problem *problem, const Rollout *ro
         Pair *slope = costate + n;
         Pair before[GPMPC_STATES + GPMPC_INPUTS];
         int stage = stage_of(k);
-        add_stage_slopes(problem, work, rollout, k, costate, slope);
-        add_input_slope(problem, work, rollout->inputs, k, slope);
+        add_stage_slopes(problem, program, rollout, k, costate, slope);
+        add_input_slope(problem, program, rollout->inputs, k, slope);
         for (i = 0; i < n; i++) {
             costate[i] = normalised(costate[i]);
             for (j = 0; j < m; j++)
@@ -238,7 +238,7 @@ static void write_exact_gradient(const gpmpc_problem *problem, const Rollout *ro
                     add_multiple(&before[j], problem->A[stage][i][j], costate[i]);
         for (i = 0; i < m; i++) {
             slope[i] = normalised(slope[i]);
-            work->gradient[k * m + i] = slope[i].high;
+            program->gradient[k * m + i] = slope[i].high;
             for (j = 0; j < n + m && problem->has_feedback; j++)
                 add_multiple(&before[j], problem->feedback[k][i][j], slope[i]);
         }
@@ -248,50 +248,51 @@ static void write_exact_gradient(const gpmpc_problem *problem, const Rollout *ro
 }
 
 /* Writes gradient and values of the present x and multipliers. */
-static void evaluate_along_dynamics(const gpmpc_problem *problem, gpmpc_program *work)
+static void evaluate_along_dynamics(const gpmpc_problem *problem,
+                                    gpmpc_program *program)
 {
     Rollout rollout;
-    roll_out(problem, work->value, work->value_low, &rollout);
-    write_exact_values(problem, &rollout, work);
-    write_exact_gradient(problem, &rollout, work);
+    roll_out(problem, program->value, program->value_low, &rollout);
+    write_exact_values(problem, &rollout, program);
+    write_exact_gradient(problem, &rollout, program);
 }
 #endif
 
 /* The same by P, q, G and the bounds of a program as they are. */
-static void evaluate_program(gpmpc_program *work)
+static void evaluate_program(gpmpc_program *program)
 {
     int i, j;
     for (j = 0; j < N; j++) {
-        Pair sum = pair_of(work->q[j], 0);
+        Pair sum = pair_of(program->q[j], 0);
         for (i = 0; i < N; i++)
-            add_multiple(&sum, work->P[j][i],
-                         pair_of(work->value[i], work->value_low[i]));
-        add_multiple(&sum, 1, multiplier_of(work, j));
-        for (i = 0; i < work->rows; i++)
-            if (work->multiplier[N + i] != 0)
-                add_multiple(&sum, work->G[i][j], multiplier_of(work, N + i));
-        work->gradient[j] = rounded(sum);
+            add_multiple(&sum, program->P[j][i],
+                         pair_of(program->value[i], program->value_low[i]));
+        add_multiple(&sum, 1, multiplier_of(program, j));
+        for (i = 0; i < program->rows; i++)
+            if (program->multiplier[N + i] != 0)
+                add_multiple(&sum, program->G[i][j], multiplier_of(program, N + i));
+        program->gradient[j] = rounded(sum);
     }
-    for (i = 0; i < work->rows; i++) {
+    for (i = 0; i < program->rows; i++) {
         Pair sum = pair_of(0, 0);
-        for (j = 0; j < work->row_end[N + i]; j++)
-            add_multiple(&sum, work->G[i][j],
-                         pair_of(work->value[j], work->value_low[j]));
+        for (j = 0; j < program->row_end[N + i]; j++)
+            add_multiple(&sum, program->G[i][j],
+                         pair_of(program->value[j], program->value_low[j]));
         sum = normalised(sum);
-        work->value[N + i] = sum.high;
-        work->value_low[N + i] = sum.low;
+        program->value[N + i] = sum.high;
+        program->value_low[N + i] = sum.low;
     }
 }
 
 /* By how much constraint p is above its upper bound, and below its lower one. */
-static real above_bound(const gpmpc_program *work, int p)
+static real above_bound(const gpmpc_program *program, int p)
 {
-    return (work->value[p] - work->upper[p])
-           + (work->value_low[p] - work->upper_low[p]);
+    return (program->value[p] - program->upper[p])
+           + (program->value_low[p] - program->upper_low[p]);
 }
 
-static real below_bound(const gpmpc_program *work, int p)
+static real below_bound(const gpmpc_program *program, int p)
 {
-    return (work->lower[p] - work->value[p])
-           + (work->lower_low[p] - work->value_low[p]);
+    return (program->lower[p] - program->value[p])
+           + (program->lower_low[p] - program->value_low[p]);
 }
