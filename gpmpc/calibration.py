@@ -53,6 +53,7 @@ from gpmpc.metrics import (
     negative_log_predictive_density,
 )
 from gpmpc.models._past import (
+    belief_of_measured,
     measured_dim,
     measured_signals,
     rows_before,
@@ -222,8 +223,9 @@ def calibrate(
             within half a turn; by default those of the model.
         measurement_noise: Standard deviations of the sensors that the states were
             measured with (n,), where they are known: starts are then as uncertain, and
-            what is compared. The model's noise has to be that of the process alone
-            (``gpmpc.estimation.separate_noise``), or it counts theirs once more.
+            what is compared. Without them a start is certain, but of a model of a log
+            as uncertain as its rows. The model's noise has to be that of the process
+            alone (``gpmpc.estimation.separate_noise``), or it counts theirs once more.
 
     Raises:
         ShapeError: Recordings, model or names do not belong together.
@@ -288,7 +290,9 @@ class _Noise(NamedTuple):
     """The noise that predictions hold."""
 
     moves_state: bool  #: whether the propagator adds the process noise at every step
-    start: Tensor  #: covariance of the states where predictions begin (n, n)
+    #: covariance of the states where predictions begin (n, n); None where the model
+    #: may know it
+    start: Tensor | None
     of_compared: Tensor  #: variances added to predictions of any step (n,)
 
 
@@ -309,18 +313,18 @@ def _assumed_noise(
     n = measured_dim(model)
     moves_state = bool(getattr(propagator, "process_noise", False))
     sensors = torch.zeros(n, dtype=model.dtype, device=model.device)
+    start = None
     if measurement_noise is not None:
         deviations = list(measurement_noise)
         check_numbers("measurement_noise", deviations, n, least=0)
         sensors = torch.tensor(
             deviations, dtype=model.dtype, device=model.device
         ).square()
+        start = torch.diag(sensors)
     of_compared = sensors
     if not moves_state and measurement_noise is None:
         of_compared = model.noise_covariance.diagonal()[:n]
-    return _Noise(
-        moves_state=moves_state, start=torch.diag(sensors), of_compared=of_compared
-    )
+    return _Noise(moves_state=moves_state, start=start, of_compared=of_compared)
 
 
 def _predict_recording(
@@ -343,11 +347,9 @@ def _predict_recording(
     states = recording.states.to(dtype=model.dtype, device=model.device)
     inputs = recording.inputs.to(dtype=model.dtype, device=model.device)
     states = whole_states(model, states, inputs)
-    further = states.shape[1] - n
-    start = pad(noise.start, (0, further, 0, further))
     for first in range(rows_before(model), size, CHUNK):
         mean = states[first : min(first + CHUNK, size)]
-        belief = Gaussian(mean, start.expand(len(mean), *start.shape))
+        belief = _start(model, mean, noise)
         for k in range(min(horizon, size - first)):
             # From here on k + 1 steps would outlast the recording.
             last = min(first + CHUNK, size - k)
@@ -360,6 +362,15 @@ def _predict_recording(
             observed = recording.states[first + k + 1 : last + k + 1].clone()
             observed[:, angles] -= whole_turns((observed - mean)[:, angles])
             yield k, _Predictions(mean=mean, variance=variance, observed=observed)
+
+
+def _start(model: DynamicsModel, states: Tensor, noise: _Noise) -> Gaussian:
+    """Returns what is believed of measured states with their past (S, n + ...)."""
+    if noise.start is None:
+        return belief_of_measured(model, states)
+    further = states.shape[1] - len(noise.start)
+    covariance = pad(noise.start, (0, further, 0, further))
+    return Gaussian(states, covariance.expand(len(states), *covariance.shape))
 
 
 def _joined(parts: list[_Predictions]) -> _Predictions:

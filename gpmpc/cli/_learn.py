@@ -15,6 +15,7 @@ import pandas as pd
 from rich.console import Console
 
 from gpmpc import logs
+from gpmpc._dynamics import Array
 from gpmpc._files import write_whole
 from gpmpc._provenance import code_fingerprint, provenance
 from gpmpc.cli._commands import Result
@@ -575,6 +576,31 @@ def _facts(
     ]
 
 
+def _tube_in_words(judgement: Judgement) -> str:
+    """Says how far a controller's tube may be trusted, by the steps ahead."""
+    sentences = []
+    for step, coverage, width in zip(
+        judgement.steps, judgement.tube_coverage, judgement.tube_width, strict=True
+    ):
+        sentences.append(
+            f"{step} steps ahead it holds {_range(coverage, '.0%')} of them, "
+            f"{_range(width, '.2f')} as wide as they are"
+        )
+    return (
+        "The intervals that were judged begin at an estimated state, hold errors that "
+        "are alike for several rows, and follow those of the run. A controller's tube "
+        "does not: white noise and an uncertain first row stand for all errors, as "
+        f"held-out rollouts make likely. Of {judgement.level:.0%}, on these rows: "
+        f"{'; '.join(sentences)} (from the groups' worst to best)."
+    )
+
+
+def _range(values: Array, form: str) -> str:
+    """Writes the smallest and the largest of some numbers, one if they are alike."""
+    low, high = (format(value, form) for value in (values.min(), values.max()))
+    return low if low == high else f"{low} to {high}"
+
+
 def _outputs(learned: IdentifiedModel) -> list[str]:
     """Returns what the model of every output is made of."""
     model = learned.model
@@ -622,14 +648,8 @@ def _doubts(
             "come: where a controller chose them by the states, they tell of these, "
             "and errors are smaller than those of a forecast made before."
         )
-    noise = learned.noise
-    correlated = noise.outputs[np.array(noise.time_constants) > 0]
-    if correlated.any():
-        doubts.append(
-            "The intervals that were judged hold errors that are alike for several "
-            "rows, and follow those of the run. A controller's tube does neither: it "
-            "takes the noise as white, and is too narrow many steps ahead."
-        )
+    if judgement.tube_width.size and not learned.model.feedback_outputs:
+        doubts.append(_tube_in_words(judgement))
     doubts.append("Outside the ranges of the data (table above) nothing was seen.")
     doubts += _doubts_of_what_stays(learned, train)
     if learned.model.feedback_outputs:

@@ -53,8 +53,8 @@ from gpmpc.exceptions import (
     check_indices,
     check_number,
 )
-from gpmpc.gaussian import Gaussian
 from gpmpc.models._past import (
+    belief_of_measured,
     first_signals,
     measured_dim,
     rows_before,
@@ -147,7 +147,7 @@ class ConformalTube:
         G = both_sides if rows is None else _as_rows(rows)
         if G.shape[1] != n:
             raise ShapeError(f"rows must be (r, {n}); got {G.shape}")
-        starts = Gaussian.certain(whole[begins])
+        starts = belief_of_measured(model, whole[begins])
         predicted = rollout(propagator, model, starts, u[steps - 1])
         covariance = to_array(predicted.covariance)[..., :n, :n]
         deviation = np.sqrt(np.einsum("ri,khij,rj->khr", G, covariance, G))

@@ -10,8 +10,8 @@ a width of one is honest.
 import bisect
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -32,7 +32,12 @@ from gpmpc.logs._comparison import (
 from gpmpc.logs._fitting import PAST
 from gpmpc.logs._learning import IdentifiedModel, fewest_rows
 from gpmpc.logs._log import Log
-from gpmpc.logs._noise import error_variances, follow_errors
+from gpmpc.logs._noise import (
+    as_flown,
+    error_variances,
+    follow_errors,
+    tube_variances,
+)
 from gpmpc.metrics import binomial_interval
 from gpmpc.models._state_space import StateSpace
 from gpmpc.models._windows import Windows
@@ -45,6 +50,7 @@ MODEL = "model"  # name of the judged model among the predictors
 _WINDOWS = 1000
 _ROUNDING_SHARE = 1e-9  # of a constant state's error: an error by rounding
 _LINEARIZED = 100  # windows linearised at once
+_TUBES = 200  # of the windows, from whose starts a controller's tube is judged
 _LARGEST_SIZE = 10.0  # of an error, in half widths of its interval, that counts
 _LEAST_SHORT_SHARE = 0.02  # of the rows in short pieces, that is told
 
@@ -75,6 +81,9 @@ class Judgement:
     #: errors of the model over those of each baseline, with intervals
     comparisons: tuple[Comparison, ...] = ()
     runs: tuple[str, ...] = ()  #: names of the runs that were predicted
+    #: of a controller's tube from every row, likewise (k, groups); empty without one
+    tube_coverage: Array = field(default_factory=lambda: np.empty((0, 0)))
+    tube_width: Array = field(default_factory=lambda: np.empty((0, 0)))
 
     @property
     def losses(self) -> tuple[str, ...]:
@@ -143,6 +152,9 @@ class Judgement:
                     row["coverage_low"] = low
                     row["coverage_high"] = high
                     row["width"] = self.width[k, g]
+                    if self.tube_width.size:
+                        row["tube_coverage"] = self.tube_coverage[k, g]
+                        row["tube_width"] = self.tube_width[k, g]
                 rows.append(row)
         return pd.DataFrame(rows)
 
@@ -214,8 +226,7 @@ def _judge_windows(
     half_width = ndtri((1 + LEVEL) / 2) * np.sqrt(variances)
     sizes = np.abs(model_errors) / np.maximum(half_width, 1e-300)
     coverage = _group_means(space, np.abs(model_errors) <= half_width)
-    claimed = _group_means(space, variances)
-    actual = _group_means(space, np.square(model_errors))
+    tube = _judge_tube(learned, windows, steps)
     return Judgement(
         groups=tuple(group.name for group in space.groups),
         units=_error_units(space),
@@ -224,11 +235,44 @@ def _judge_windows(
         rmse={n: np.sqrt(np.square(d).mean(axis=0)) for n, d in distances.items()},
         coverage=coverage,
         coverage_interval=_coverage_intervals(coverage, sizes, windows, steps),
-        width=np.sqrt(claimed / np.maximum(actual, 1e-300)),
+        width=_width(space, variances, model_errors),
         windows=(len(windows),) * len(steps),
         comparisons=_comparisons(distances, windows, steps, longest),
         runs=tuple(name for number, name in enumerate(names) if number in windows.runs),
+        tube_coverage=tube.coverage,
+        tube_width=tube.width,
     )
+
+
+class _TubeJudgement(NamedTuple):
+    """How well a controller's tube holds; (steps, groups), or empty without one."""
+
+    coverage: Array
+    width: Array
+
+
+def _judge_tube(
+    learned: IdentifiedModel, windows: Windows, steps: Sequence[int]
+) -> _TubeJudgement:
+    """Judges a controller's tube on some of the windows."""
+    tube = learned.noise.tube
+    if tube is None:
+        return _TubeJudgement(np.empty((0, 0)), np.empty((0, 0)))
+    fewer = windows[:: -(-len(windows) // _TUBES)]
+    errors = as_flown(learned.model).rollout_errors(fewer, steps)
+    variances = tube_variances(learned.model, fewer, tube, steps)
+    half_width = ndtri((1 + LEVEL) / 2) * np.sqrt(variances)
+    return _TubeJudgement(
+        coverage=_group_means(windows.space, np.abs(errors) <= half_width),
+        width=_width(windows.space, variances, errors),
+    )
+
+
+def _width(space: StateSpace, variances: Array, errors: Array) -> Array:
+    """Returns claimed over actual root mean square (steps, groups)."""
+    claimed = _group_means(space, variances)
+    actual = _group_means(space, np.square(errors))
+    return np.sqrt(claimed / np.maximum(actual, 1e-300))
 
 
 def _joined(parts: Sequence[Judgement]) -> Judgement:
@@ -253,6 +297,8 @@ def _joined(parts: Sequence[Judgement]) -> Judgement:
             for own in zip(*(part.comparisons for part in parts), strict=True)
         ),
         runs=tuple(dict.fromkeys(name for part in parts for name in part.runs)),
+        tube_coverage=np.concatenate([part.tube_coverage for part in parts]),
+        tube_width=np.concatenate([part.tube_width for part in parts]),
     )
 
 

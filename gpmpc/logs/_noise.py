@@ -7,10 +7,14 @@ first-order autoregressions with a few time constants, and for each measured ent
 measurement noise. Non-negative least squares on the mean squared errors at several
 steps find the variances. Errors one step ahead alone, on filtered rows, would
 understate them many times.
+
+A controller's tube has no more than white noise and an uncertain start; both are fitted
+to the same errors, but of rollouts that begin at a row as it was measured.
 """
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,8 +25,8 @@ from gpmpc.logs._fitting import PAST
 from gpmpc.logs._log import Log
 from gpmpc.logs._ranges import difference_steps, widths_of
 from gpmpc.models._kinematics import Kinematics
-from gpmpc.models._log_dynamics import TIME_CONSTANTS, OutputNoise
-from gpmpc.models._log_model import LogModel
+from gpmpc.models._log_dynamics import TIME_CONSTANTS, OutputNoise, TubeNoise
+from gpmpc.models._log_model import DIVERGED, LogModel
 from gpmpc.models._windows import Windows
 
 _STEPS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 50)  # whose errors are explained,
@@ -37,6 +41,9 @@ _LARGEST_CLAIM = 9.0  # of the mean squared error: the variance claimed at most
 _LEAST_FREEDOM = 4.0  # independent errors that a variance is supposed to be of
 _CUTS = 8  # rounds in which what is cut off is made up for
 _SMALLEST_VARIANCE = 1e-300  # that anything is divided by
+_SCORING_ROUNDS = 20  # in which the noise of a tube is fitted
+_LEAST_CLAIM = 0.02  # of the mean squared error: the variance claimed at least in these
+_LEAST_SHARE = 0.01  # of a claimed variance that a source of a tube's noise has
 #: time constant with which the weight of an earlier error decays, in multiples of the
 #: time of the longest prediction
 _FORGETTING = 6.0
@@ -64,6 +71,51 @@ def error_variances(
     explained = responses @ variances * noise.scales_at(steps)
     explained = np.minimum(explained, noise.largest_at(steps))
     return np.repeat(explained, stride, axis=0)[: len(windows)]
+
+
+def tube_variances(
+    model: LogModel, windows: Windows, tube: TubeNoise, steps: Sequence[int]
+) -> Array:
+    """Computes the variances (W, steps, e) of a controller's tube.
+
+    Args:
+        model: With its parameters.
+        windows: W of them, at whose starts it begins.
+        tube: Its noise.
+        steps: After the starts.
+    """
+    white, by_start = _of_tube(_flown_responses(model, windows, steps))
+    return white @ tube.outputs + by_start @ tube.start
+
+
+def as_flown(model: LogModel) -> LogModel:
+    """Returns the model whose rollouts begin at a row and go on uncorrected.
+
+    A controller plans so. Its own estimate of a disturbance takes the place of the
+    model's, which stays.
+    """
+    if model.start_filter is None and model.correction is None:
+        return model
+    return replace(model, start_filter=None, correction=None)
+
+
+def _flown_responses(model: LogModel, windows: Windows, steps: Sequence[int]) -> Array:
+    """Computes the responses of a tube: to white noise and to measurements.
+
+    A controller linearises the model without the disturbance, which it adds to the
+    next states.
+    """
+    undisturbed = replace(as_flown(model), history=(0,) * len(model.history))
+    return _responses(undisturbed, windows, steps, time_constants=(0.0,))
+
+
+def _of_tube(responses: Array) -> tuple[Array, Array]:
+    """Splits responses of a tube: to the outputs' noise, and to that of the start.
+
+    What is measured where a prediction ends is no part of the second.
+    """
+    e = responses.shape[-2]
+    return responses[..., :-e], responses[..., -e:] - np.eye(e)
 
 
 def follow_errors(
@@ -119,12 +171,31 @@ class _FoldErrors(NamedTuple):
     """Errors of the windows of one fold."""
 
     squared: Array  # of rollouts (W, steps, e)
+    squared_flown: Array  # of rollouts that begin at a row, uncorrected (W, steps, e)
     responses: Array  # to the sources, of fewer windows (V, steps, e, sources)
+    # To white noise and the measurements alone, of the model that a controller has.
+    flown_responses: Array
     squared_residuals: Array  # of outputs one step ahead (W, o)
 
 
+def noise_steps(longest: int) -> list[int]:
+    """Returns the steps ahead whose errors the noise explains.
+
+    Args:
+        longest: Steps of the rollouts.
+    """
+    steps = [step for step in _STEPS if step <= longest]
+    if longest > _STEPS[-1]:
+        steps += [*(step for step in _FAR_STEPS if step < longest), longest]
+    return steps
+
+
 def fit_noise(
-    models: Sequence[LogModel], logs: Sequence[Log], longest: int
+    models: Sequence[LogModel],
+    logs: Sequence[Log],
+    steps: Sequence[int],
+    gains: Array | float = 1.0,
+    flown_gains: Array | float = 1.0,
 ) -> OutputNoise:
     """Fits the noise that explains the errors of rollouts on held-out runs.
 
@@ -136,11 +207,10 @@ def fit_noise(
     Args:
         models: One for each fold.
         logs: The runs that the model of each fold was not fitted to.
-        longest: Steps of the rollouts.
+        steps: Of ``noise_steps``.
+        gains: By which a model of all rows errs less (steps, e): factors of squares.
+        flown_gains: Likewise of rollouts as a controller makes them.
     """
-    steps = [step for step in _STEPS if step <= longest]
-    if longest > _STEPS[-1]:
-        steps += [*(step for step in _FAR_STEPS if step < longest), longest]
     linearized = _LINEARIZED if models[0].memory.empty else _LINEARIZED_WITH_MEMORY
     folds = [
         _fold_errors(
@@ -162,22 +232,110 @@ def fit_noise(
     finite = np.where(np.isfinite(shares), shares, 0.0)
     # Each source is scaled so that its largest share of an error is one.
     largest_share = np.maximum(finite.max(axis=0), _SMALLEST_VARIANCE)
-    sharing = _sharing_rows(models[0], largest_share, residuals)
+    sharing = _sharing_rows(
+        models[0], largest_share, residuals, time_constants=len(TIME_CONSTANTS)
+    )
     regressors = np.vstack([shares / largest_share, sharing])
     targets = np.r_[np.ones(len(shares)), np.zeros(len(sharing))]
     variances = _nonnegative_solution(regressors, targets) / largest_share
     output_sources = len(TIME_CONSTANTS) * len(residuals)
     largest = np.maximum(_LARGEST_CLAIM * squared, _SMALLEST_VARIANCE)
     kinematics = models[0].kinematics
+    rows = sum(len(log) for log in logs)
+    student_factors = _student_factors(rows, steps)[:, None]
+    squared_flown = _mean_of_finite([fold.squared_flown for fold in folds])
+    flown_responses = np.concatenate([fold.flown_responses for fold in folds])
+    near = sum(step <= _STEPS[-1] for step in steps)  # as far as controllers plan
     noise = OutputNoise(
         outputs=variances[:output_sources].reshape(len(TIME_CONSTANTS), -1),
         measurement=variances[output_sources:],
         steps=tuple(steps),
         scales=_scales(kinematics, squared, by_window @ variances, largest),
         largest=largest,
+        tube=_fit_tube(
+            model=models[0],
+            squared=(flown_gains * student_factors * squared_flown)[:near],
+            responses=flown_responses.mean(axis=0)[:near],
+            residuals=residuals,
+            steps=steps[:near],
+        ),
     )
-    rows = sum(len(log) for log in logs)
-    return noise.scaled(_student_factors(rows, steps)[:, None])
+    return noise.scaled(gains * student_factors)
+
+
+def _fit_tube(
+    model: LogModel,
+    squared: Array,
+    responses: Array,
+    residuals: Array,
+    steps: Sequence[int],
+) -> TubeNoise:
+    """Fits the noise of a controller's tube to the errors of held-out rollouts.
+
+    White noise and an uncertain start have to do for all that an ``OutputNoise`` has;
+    the noise of the row where a prediction ends is in that of the start. The variances
+    are those under which the errors are most likely, by Fisher's scoring: least squares
+    of the squared errors, in units of the variances that were claimed before. In units
+    of the squared errors themselves, to claim nothing would cost no more than to claim
+    twice too much.
+
+    Args:
+        model: Has the groups.
+        squared: Mean squared errors of rollouts that begin at a row (steps, e).
+        responses: Those of a tube (steps, e, o + e).
+        residuals: Mean squared residuals of the outputs (o,).
+        steps: Ahead.
+    """
+    o = len(residuals)
+    e = squared.shape[1]
+    regressors = np.concatenate(_of_tube(responses), axis=-1).reshape(-1, o + e)
+    targets = squared.ravel()
+    # Roots of weights: what least squares squares.
+    weights = np.repeat(_step_weights(steps) ** 0.5, e)
+    usable = np.isfinite(targets) & np.isfinite(regressors).all(axis=1)
+    regressors = regressors[usable]
+    weights = weights[usable]
+    targets = np.maximum(targets[usable], _SMALLEST_VARIANCE)
+    claimed = targets
+    variances = np.zeros(o + e)
+    for _ in range(_SCORING_ROUNDS):
+        units = weights / claimed
+        shares = regressors * units[:, None]
+        largest_share = np.maximum(shares.max(axis=0, initial=0.0), _SMALLEST_VARIANCE)
+        sharing = _sharing_rows(model, largest_share, residuals, time_constants=1)
+        scaled = _nonnegative_solution(
+            np.vstack([shares / largest_share, sharing]),
+            np.r_[targets * units, np.zeros(len(sharing))],
+        )
+        # A filter of a model without any noise would hear no sensor.
+        variances = np.maximum(scaled, _LEAST_SHARE) / largest_share
+        claimed = np.maximum(regressors @ variances, _LEAST_CLAIM * targets)
+    return TubeNoise(outputs=variances[:o], start=variances[o:])
+
+
+def _step_weights(steps: Sequence[int]) -> Array:
+    """Returns how much each step ahead counts in a likelihood (steps,).
+
+    It is the root of the number of steps that it stands for. Were each of these to
+    count alike, tubes of coloured noise would be many times too wide one step ahead;
+    were each doubling, too narrow at the last one.
+    """
+    if len(steps) < 2:
+        return np.ones(len(steps))
+    weights = np.sqrt(np.gradient(steps))
+    return weights / weights.max()
+
+
+def _mean_of_finite(squared: Sequence[Array]) -> Array:
+    """Averages squared errors (W, steps, e) over all rollouts that did not diverge.
+
+    Infinite where all of them did.
+    """
+    errors = np.concatenate(squared)
+    converged = errors < DIVERGED**2
+    number = converged.sum(axis=0)
+    total = np.where(converged, errors, 0.0).sum(axis=0)
+    return np.where(number > 0, total / np.maximum(number, 1), np.inf)
 
 
 def _nonnegative_solution(regressors: Array, targets: Array) -> Array:
@@ -292,14 +450,29 @@ def _fold_errors(
     windows = log.windows(max(steps), past=max(model.past, PAST), most=most)
     stride = -(-len(windows) // linearized)
     measured, modelled = model.first_outputs(windows)
+    squared = np.square(model.rollout_errors(windows, steps))
+    flown = as_flown(model)
+    squared_flown = squared
+    if flown is not model:
+        squared_flown = np.square(flown.rollout_errors(windows, steps))
+    responses = _responses(model, windows[::stride], steps, TIME_CONSTANTS)
+    outputs = measured.shape[1]
+    others = slice(outputs, len(TIME_CONSTANTS) * outputs)
+    flown_responses = np.delete(responses, others, axis=-1)
+    if any(model.history):
+        flown_responses = _flown_responses(model, windows[::stride], steps)
     return _FoldErrors(
-        squared=np.square(model.rollout_errors(windows, steps)),
-        responses=_responses(model, windows[::stride], steps, TIME_CONSTANTS),
+        squared=squared,
+        squared_flown=squared_flown,
+        responses=responses,
+        flown_responses=flown_responses,
         squared_residuals=np.square(measured - modelled),
     )
 
 
-def _sharing_rows(model: LogModel, scales: Array, residuals: Array) -> Array:
+def _sharing_rows(
+    model: LogModel, scales: Array, residuals: Array, time_constants: int
+) -> Array:
     """Returns rows of least squares by which the outputs of a group share.
 
     They are zero where the variances of two outputs share as the residuals do.
@@ -308,10 +481,11 @@ def _sharing_rows(model: LogModel, scales: Array, residuals: Array) -> Array:
         model: Has the groups.
         scales: Of each source's variance in the least squares (sources,).
         residuals: Mean squared residuals of the outputs (o,).
+        time_constants: Number of those, for each of which outputs are sources.
     """
     rows = []
     o = len(residuals)
-    for first_source in range(0, len(TIME_CONSTANTS) * o, o):
+    for first_source in range(0, time_constants * o, o):
         for group in model.kinematics.output_groups.values():
             for i, j in itertools.pairwise(group):
                 pair = [first_source + i, first_source + j]

@@ -10,7 +10,7 @@ from gpmpc.exceptions import DataError
 from gpmpc.logs._fitting import PAST, NominalFit
 from gpmpc.logs._folds import MANY_RUNS, Fold
 from gpmpc.logs._log import Log
-from gpmpc.logs._noise import fit_noise, learning_gains
+from gpmpc.logs._noise import as_flown, fit_noise, learning_gains, noise_steps
 from gpmpc.logs._rollout_corrections import (
     Averages,
     Rollouts,
@@ -156,20 +156,22 @@ class Validations:
             )
             models.append(model)
         held_out = [validation.held_out for validation in validations]
-        noise = fit_noise(models, held_out, self._steps)
+        steps = noise_steps(self._steps)
         has_halves = len(validations) > len(self._folds)
         # Of many runs, how unlike they are decides, not how many rows they have.
         if not has_halves or len(self._log.runs) >= MANY_RUNS:
-            return noise
+            return fit_noise(models, held_out, steps)
         of_halves = self.corrected_models(structure)
-        gains = learning_gains(
-            fewer=[of_halves[validation.fold] for validation in validations],
-            models=models,
+        fewer = [of_halves[validation.fold] for validation in validations]
+        gains = learning_gains(fewer, models, held_out, steps, _GAIN_EXPONENT)
+        flown_gains = learning_gains(
+            fewer=[as_flown(model) for model in fewer],
+            models=[as_flown(model) for model in models],
             logs=held_out,
-            steps=noise.steps,
+            steps=steps,
             exponent=_GAIN_EXPONENT,
         )
-        return noise.scaled(gains)
+        return fit_noise(models, held_out, steps, gains, flown_gains)
 
     def fit_to_all_runs(self, structure: Structure) -> NominalFit:
         """Fits a structure to all runs, its GPs and its correction as well."""

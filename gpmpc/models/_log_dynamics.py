@@ -11,12 +11,13 @@ controller's own estimate.
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gpmpc._angles import full_turns
+from gpmpc._angles import full_turns, wrap
 from gpmpc._arrays import read_array
 from gpmpc._dynamics import Array, Linearized, check_query, to_array
 from gpmpc.exceptions import SettingError, ShapeError
@@ -31,6 +32,19 @@ from gpmpc.signals import UNKNOWN, Signals
 #: of the coloured noise of outputs [rows]; zero is white
 TIME_CONSTANTS = (0.0, 5.0, 25.0, 100.0)
 _NO_CONTEXT = np.empty(0)
+
+
+class TubeNoise(NamedTuple):
+    """Variances of the noise of a controller's tube.
+
+    Its covariance grows by the same white noise at every step, from that of a row that
+    was measured once. Both are fitted to the errors of held-out rollouts from such rows
+    at many steps ahead: the noise of the sensors is in the start and not in the steps,
+    and white noise stands for noise that is alike for several rows.
+    """
+
+    outputs: Array  #: of the outputs (o,), in their squared units
+    start: Array  #: of each entry of a difference of states (e,), likewise
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,9 +62,10 @@ class OutputNoise:
     largest: Array = field(default_factory=lambda: np.empty((0, 0)))
     #: of the outputs' noise [rows] (T,); zero is white
     time_constants: tuple[float, ...] = TIME_CONSTANTS
+    tube: TubeNoise | None = None  #: of a controller's tube; older files have none
 
     def scaled(self, factors: Array) -> "OutputNoise":
-        """Returns the noise with other variances of predictions.
+        """Returns the noise with other variances of predictions, and the same tube.
 
         Args:
             factors: By which they change, by step and entry (S, e) or (S, 1).
@@ -201,7 +216,10 @@ class LogDynamics:
 
     @property
     def noise_covariance(self) -> Tensor:
-        """Covariance of the next state's noise at the state of zeros (n, n)."""
+        """Covariance of the next state's noise at the state of zeros (n, n).
+
+        The sensors' noise is no part of it: see ``start_covariance``.
+        """
         return self._noise_at_origin
 
     @cached_property
@@ -213,14 +231,53 @@ class LogDynamics:
         origin = np.zeros((1, n))
         origin[:, : space.dim] = space.origin
         B = self._derivatives_by_outputs(origin, np.zeros((1, self.input_dim)))[0]
-        h = DIFFERENCE * np.eye(space.error_dim)
-        forward = space.displace(space.origin[None], h)
-        backward = space.displace(space.origin[None], -h)
-        D = np.zeros((n, space.error_dim))  # what is remembered has no noise of its own
-        D[: space.dim] = (forward - backward).T / (2 * DIFFERENCE)
-        by_outputs = B * self.noise.outputs.sum(axis=0) @ B.T
-        covariance = by_outputs + D * self.noise.measurement @ D.T
+        tube = self.noise.tube
+        if tube is not None:
+            covariance = B * tube.outputs @ B.T
+        else:
+            covariance = B * self.noise.outputs.sum(axis=0) @ B.T
+            measured = slice(0, space.dim)  # what is remembered has none of its own
+            covariance[measured, measured] += self._covariance_of_errors(
+                space.origin, self.noise.measurement
+            )
         return torch.from_numpy((covariance + covariance.T) / 2)
+
+    def start_covariance(self, measured: Array | None = None) -> Array:
+        """Computes the covariances of states that were measured once.
+
+        Predictions from rows of sensors like those of the log begin with them. They are
+        zero without noise, and of older files, whose ``noise_covariance`` holds the
+        sensors' noise.
+
+        Args:
+            measured: (..., measured_dim); the state of zeros by default.
+
+        Returns:
+            (..., measured_dim, measured_dim).
+        """
+        if measured is None:
+            measured = self.model.kinematics.space.origin
+        if self.noise is None or self.noise.tube is None:
+            n = self.measured_dim
+            return np.zeros((*measured.shape[:-1], n, n))
+        return self._covariance_of_errors(measured, self.noise.tube.start)
+
+    def _covariance_of_errors(self, measured: Array, variances: Array) -> Array:
+        """Computes covariances (..., n, n) of states from variances of errors (e,).
+
+        Args:
+            measured: The states (..., n).
+            variances: Of differences of states (e,).
+        """
+        space = self.model.kinematics.space
+        h = DIFFERENCE * np.eye(space.error_dim)
+        forward = space.displace(measured[..., None, :], h)
+        backward = space.displace(measured[..., None, :], -h)
+        differences = forward - backward
+        angles = list(space.angles)
+        differences[..., angles] = wrap(differences[..., angles])
+        D = np.swapaxes(differences, -1, -2) / (2 * DIFFERENCE)
+        return D * variances @ np.swapaxes(D, -1, -2)
 
     def predict(self, state: Tensor, input: Tensor) -> Gaussian:
         """Predicts the next state: mean (*batch, n), covariance (*batch, n, n)."""

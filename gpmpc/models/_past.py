@@ -1,8 +1,9 @@
-"""Models whose state holds the past beside what is measured.
+"""What a loop measures of a model's state, and how it completes it.
 
 A loop measures the first states of such a model alone. What follows them is known from
 the rows before: inputs on their way, what lags hold, what is remembered. It is kept
-from step to step by ``at_rest``, where a flight begins, and ``follow``.
+from step to step by ``at_rest``, where a flight begins, and ``follow``. A model of a
+log knows as well how uncertain a state is that sensors like those of the log measured.
 
 Two numbers tell such models apart, and each has several names:
 
@@ -13,12 +14,14 @@ Two numbers tell such models apart, and each has several names:
   ``rows_before`` of any. ``rows_back`` of a ``Memory`` is its part of it.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Protocol, TypeGuard
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from gpmpc._dynamics import Array, DynamicsModel, to_array
 from gpmpc.gaussian import Gaussian
@@ -99,6 +102,91 @@ def has_past(model: Any) -> TypeGuard[ModelWithPast]:
     """Returns whether a model's state holds more than what is measured."""
     measured = getattr(model, "measured_dim", None)
     return measured is not None and measured < model.state_dim
+
+
+def start_covariance(model: Any, measured: Array | None = None) -> Array | None:
+    """Returns how uncertain states are that were measured once.
+
+    Args:
+        model: Or one that it is around.
+        measured: The states that are measured (..., n); that of zeros by default.
+
+    Returns:
+        The covariances (..., n, n); None where no model knows them.
+    """
+    covariance_of = _start_covariance_of(model)
+    return None if covariance_of is None else covariance_of(measured)
+
+
+def _start_covariance_of(model: Any) -> Callable[[Array | None], Array] | None:
+    """Returns the ``start_covariance`` of a model, or of one that it is around."""
+    while model is not None:
+        own = getattr(model, "start_covariance", None)
+        if own is not None:
+            return own
+        model = getattr(model, "model", None)
+    return None
+
+
+def variances_of_next_row(model: Any) -> Array | None:
+    """Returns how far a row scatters around what is predicted of it (n,), squared.
+
+    It is the model's noise and, where the model knows it, that of a measured start.
+    None where the model has no noise.
+
+    Raises:
+        UnsupportedModel: The noise depends on the state.
+    """
+    noise = getattr(model, "noise_covariance", None)
+    if noise is None:
+        return None
+    variances = to_array(noise).diagonal().copy()
+    start = start_covariance(model)
+    if start is not None:
+        variances[: len(start)] += start.diagonal()
+    return variances
+
+
+def as_measured(model: Any, belief: Gaussian, names: Sequence[str]) -> Gaussian:
+    """Returns a belief over measured states, as uncertain as its model knows them.
+
+    A belief that is not certain, such as a filter's, stays as it is, and so does one
+    over other states.
+
+    Args:
+        model: May know it, or one that it is around.
+        belief: Sorted by names where it has some.
+        names: Of the states.
+    """
+    covariance_of = _start_covariance_of(model)
+    if covariance_of is None or bool(belief.covariance.any()):
+        return belief
+    belief = belief.in_order(names)
+    mean = to_array(belief.mean)
+    if len(mean) != measured_dim(model):
+        return belief
+    covariance = covariance_of(mean)
+    if not np.isfinite(covariance).all():
+        return belief
+    return replace(belief, covariance=torch.from_numpy(covariance).to(belief.mean))
+
+
+def belief_of_measured(model: DynamicsModel, states: Tensor) -> Gaussian:
+    """Returns what is believed of states that were measured, with all of their past.
+
+    They are certain where the model does not know better.
+
+    Args:
+        model: Of the states.
+        states: (S, n + ...), what is measured and what a model carries on.
+    """
+    n = measured_dim(model)
+    covariance = start_covariance(model, to_array(states[:, :n]))
+    if covariance is None:
+        return Gaussian.certain(states)
+    further = states.shape[1] - n
+    padded = pad(torch.from_numpy(covariance).to(states), (0, further, 0, further))
+    return Gaussian(states, padded)
 
 
 def states_along(model: ModelWithPast, measured: Array, inputs: Array) -> Array:

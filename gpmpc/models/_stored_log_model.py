@@ -30,7 +30,7 @@ from gpmpc.gp._storage import (
 from gpmpc.models._correction import BINS, ROWS_SEEN, Correction, StartFilter
 from gpmpc.models._grouped import GroupedNominal
 from gpmpc.models._kinematics import Increments, Kinematics, RigidBodyKinematics
-from gpmpc.models._log_dynamics import LogDynamics, OutputNoise
+from gpmpc.models._log_dynamics import LogDynamics, OutputNoise, TubeNoise
 from gpmpc.models._log_model import LogModel, OutputGP
 from gpmpc.models._memory import NO_MEMORY, Memory, Products
 from gpmpc.models._namings import NO_NAMINGS, Namings
@@ -90,6 +90,9 @@ def log_model_parts(
         tensors["noise/scales"] = torch.from_numpy(named.noise.scales)
     if named.noise.largest.size:
         tensors["noise/largest"] = torch.from_numpy(named.noise.largest)
+    if named.noise.tube is not None:
+        tensors["noise/tube_outputs"] = torch.from_numpy(named.noise.tube.outputs)
+        tensors["noise/tube_start"] = torch.from_numpy(named.noise.tube.start)
     gps = []
     for i, gp in enumerate(model.gps):
         gp_header, gp_tensors = posterior_parts(path, gp.posterior)
@@ -241,6 +244,12 @@ def log_model_of_parts(
         )
     if "noise/largest" in tensors:  # likewise
         noise = replace(noise, largest=tensors["noise/largest"].numpy())
+    if "noise/tube_outputs" in tensors:  # likewise
+        tube = TubeNoise(
+            outputs=tensors["noise/tube_outputs"].numpy(),
+            start=tensors["noise/tube_start"].numpy(),
+        )
+        noise = replace(noise, tube=tube)
     _check_noise(noise, kinematics)
     named = NamedLogModel(
         model=model,
@@ -640,6 +649,8 @@ def _check_noise(noise: OutputNoise, kinematics: Kinematics) -> None:
     check_shape("noise/measurement", noise.measurement, (kinematics.space.error_dim,))
     if not all(np.isfinite(a).all() for a in (noise.outputs, noise.measurement)):
         raise DataError("noise must be finite")
+    if noise.tube is not None:
+        _check_tube(noise.tube, outputs, kinematics.space.error_dim)
     if not noise.steps:
         return
     _check_noise_steps(noise.steps)
@@ -652,6 +663,15 @@ def _check_noise(noise: OutputNoise, kinematics: Kinematics) -> None:
     check_shape("noise/largest", noise.largest, shape)
     if not (np.isfinite(noise.largest) & (noise.largest > 0)).all():
         raise DataError("noise/largest must be finite and positive")
+
+
+def _check_tube(tube: TubeNoise, outputs: int, error_dim: int) -> None:
+    """Raises ``DataError`` unless the noise of a tube is that of a model."""
+    check_shape("noise/tube_outputs", tube.outputs, (outputs,))
+    check_shape("noise/tube_start", tube.start, (error_dim,))
+    for name, variances in tube._asdict().items():
+        if not (np.isfinite(variances) & (variances >= 0)).all():
+            raise DataError(f"noise/tube_{name} must be finite and not negative")
 
 
 def _check_noise_steps(steps: Sequence[int]) -> None:

@@ -30,8 +30,8 @@ from typing import Any, Literal, NamedTuple, NoReturn
 
 import numpy as np
 
-from gpmpc._dynamics import to_array
 from gpmpc.exceptions import ShapeError, UnsupportedModel
+from gpmpc.models._past import variances_of_next_row
 from gpmpc.mpc import _flight_checks as checks
 from gpmpc.mpc._controller import Decision, model_of
 from gpmpc.mpc._cost import Tracking
@@ -307,12 +307,11 @@ def _learned_noise(controller: Any) -> Array | None:
     prediction = getattr(steering, "prediction", None)
     model = model_of(controller)
     try:
-        noise = getattr(model, "noise_covariance", None)
+        variances = variances_of_next_row(model)
     except UnsupportedModel:  # it depends on the state
-        noise = None
-    if noise is None:
+        variances = None
+    if variances is None:
         return None
-    variances = to_array(noise).diagonal().copy()
     settings = getattr(prediction, "settings", None)
     propagator = getattr(prediction, "propagator", None)
     planned = settings is not None and settings.covariance != "none"

@@ -14,7 +14,7 @@ import numpy as np
 from gpmpc._arrays import is_measured
 from gpmpc._dynamics import Array, linearize, to_array
 from gpmpc.gaussian import Gaussian
-from gpmpc.models._past import ModelWithPast, belief_of_all, has_past
+from gpmpc.models._past import ModelWithPast, as_measured, belief_of_all, has_past
 from gpmpc.mpc._controller import Decision, Reference, all_measured, model_of
 from gpmpc.mpc._sqp import FAILURES
 from gpmpc.signals import signals_of
@@ -44,12 +44,15 @@ class Situation:
 
         Args:
             controller: Whose model counts.
-            belief: Over what is measured, or over all of the model's state.
+            belief: Over what is measured, or over all of the model's state. A certain
+                one becomes as uncertain as the model knows measured states.
             reference: Likewise.
             last_state: That the step before began in; None at the first.
             last_input: That was applied there.
         """
         model = model_of(controller)
+        signals = signals_of(controller)
+        belief = as_measured(model, belief, signals.state_names)
         if not has_past(model):
             return cls(belief, reference)
         n = model.measured_dim
@@ -58,7 +61,6 @@ class Situation:
         weighed = n if problem is None else problem.state_dim
         if belief.mean.shape[-1] != n or weighed != n:
             return cls(belief, reference)
-        signals = signals_of(controller)
         belief = belief.in_order(signals.state_names)
         reference = reference.in_order(signals)
         measured = to_array(belief.mean)

@@ -22,6 +22,7 @@ from gpmpc.gp import Training, Transitions
 from gpmpc.learning import EpisodicLearning, OnlineLearning
 from gpmpc.learning._controller import check_no_disturbance_estimate
 from gpmpc.models import train
+from gpmpc.models._past import variances_of_next_row
 from gpmpc.models._training import KINEMATICS, KinematicsChoice
 from gpmpc.mpc._policy import OnFailure, check_policy
 from gpmpc.mpc.problem import Problem
@@ -175,8 +176,9 @@ class Experiment:
             return nothing
         model = self.model if training is None else training.posterior
         if model is not None and self.learns:
-            learned_variances = model.noise_covariance.diagonal()[: len(nothing)]
-            return learned_variances.sqrt().numpy()
+            learned_variances = variances_of_next_row(model)
+            assert learned_variances is not None
+            return np.sqrt(learned_variances[: len(nothing)])
         noise_of_plant = None if self.noise is None else self.noise.process
         if noise_of_plant is None:
             return nothing

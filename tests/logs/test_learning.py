@@ -291,13 +291,13 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
     assert judgement.runs == (run.name,)
     (sentence,) = short_pieces(learned, judgement, pieces, train)
     assert "42% of the held-out rows" in sentence
-    # A tube takes all noise as white.
-    for correlated in (0.0, 1e-4):
-        outputs = learned.noise.outputs.copy()
-        outputs[1:] = correlated
-        noise = replace(learned.noise, outputs=outputs)
-        doubts = _doubts(replace(learned, noise=noise), judgement, pieces, train)
-        assert any("A controller's tube" in one for one in doubts) == (correlated > 0)
+    # How well a controller's tube holds is measured.
+    doubts = _doubts(learned, judgement, pieces, train)
+    (sentence,) = [one for one in doubts if "A controller's tube" in one]
+    coverage = judgement.tube_coverage[1]
+    width = judgement.tube_width[1]
+    assert f"50 steps ahead it holds {coverage.min():.0%}" in sentence
+    assert f" to {width.max():.2f} as wide as they are (from" in sentence
     assert any("knows the inputs to come" in one for one in doubts)
     terms = replace(learned.model, weights=np.ones((2, 3)), without_nominal=(0,))
     first, last = outputs_in_words(replace(learned, model=terms))

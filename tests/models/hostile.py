@@ -45,7 +45,7 @@ from gpmpc.models import (
     save_model,
 )
 from gpmpc.models._kinematics import Increments
-from gpmpc.models._log_dynamics import TIME_CONSTANTS, OutputNoise
+from gpmpc.models._log_dynamics import TIME_CONSTANTS, OutputNoise, TubeNoise
 from gpmpc.models._log_model import OutputGP
 from gpmpc.models._parametric import AffineNominal
 from gpmpc.models._state_space import StateGroup, StateSpace
@@ -124,6 +124,7 @@ def learned(kinematics, nominal, inputs, parameters, features):
             np.full(space.error_dim, 0.01),
             (1, 10),
             np.full((2, space.error_dim), 1.1),
+            tube=TubeNoise(np.full(outputs, 0.2), np.full(space.error_dim, 0.03)),
         ),
         fit=NominalFit(model, np.full(parameters, 0.2)),
         candidates=(Candidate("one", np.ones((2, 2)), True),),
