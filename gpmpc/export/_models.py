@@ -1,4 +1,13 @@
-"""Models as C: one function for each model, around the tables of its GPs."""
+"""Models as C: one function for each model, around the tables of its GPs.
+
+To add a kind of model: choose it in ``ModelWriter.write``, and write there its tables,
+its function (``_SIGNATURE``; A is NULL where the mean alone is asked for), and, for
+tubes and filters, ``_write_variances`` and ``_write_covariance``. What it works in is a
+size (``_reserve``), with a comment in ``_problems`` and a member of ``gpmpc_work`` in
+``core.h``. Ranges of its data, where there are some, come from the controller's
+``data_scales``. Then ``docs/export.md`` says so, and a case of
+``tests/export/test_decisions.py`` decides as Python does.
+"""
 
 from collections.abc import Sequence
 from functools import partial
@@ -32,7 +41,8 @@ class ModelWriter:
 
     Attributes:
         variances: Whether functions of variances are written, too.
-        sizes: Of what its functions work in: N, d N, k N and k, at most.
+        sizes: Of what its functions work in: N points, d N differences, k N kernels and
+            k outputs, at most.
     """
 
     def __init__(self, numbers: Numbers, variances: bool, means_alone: bool):

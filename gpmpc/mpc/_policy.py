@@ -247,11 +247,12 @@ def _decides_together(controller: Controller) -> bool:
 class ControlLoop:
     """Steers a plant that is not ours, step by step.
 
-    It holds what one step needs of the last. What ``input`` returns is finite, and
-    within the bounds and rates of the controller's problem, whatever happened: a
-    measurement that is not finite or 1e30 or more in size, parameters that are not
-    finite, a program without a solution, an error of the numbers. Before the first
-    plan that is the reference's input, or the controller's initial one.
+    It holds what one step needs of the last. What ``input`` returns is finite, within
+    the bounds of the controller's problem and, where these allow it, its rates,
+    whatever happened: a measurement that is not finite or 1e30 or more in size,
+    parameters that are not finite, a program without a solution, an error of the
+    numbers. Before the first plan that is the reference's input, or the controller's
+    initial one.
 
     Args:
         controller: With a problem and an initial input.
