@@ -318,9 +318,17 @@ class Decision:
 
 def model_of(controller: Any) -> Any:
     """Returns the model that a controller predicts with; None where it has none."""
-    steering = getattr(controller, "controller", controller)  # of one around another
-    prediction = getattr(steering, "prediction", None)
-    return getattr(steering, "model", None) or getattr(prediction, "model", None)
+    steering = steering_of(controller)
+    model = getattr(steering, "model", None)
+    if model is not None:
+        return model
+    return getattr(getattr(steering, "prediction", None), "model", None)
+
+
+def steering_of(controller: Any) -> Any:
+    """Returns the innermost one of controllers around each other."""
+    inner = getattr(controller, "controller", None)
+    return controller if inner is None else steering_of(inner)
 
 
 class Controller(Protocol):

@@ -9,12 +9,12 @@ was planned. Each step of a flight tells more, and a judge looks at
   the sensors, and a share of what moves. The sensors' noise is not known: it is the
   median of squared differences of successive innovations, in which what changes slowly
   has no part, and a jump no weight;
-* the *promise*: what the stages of a plan cost, and what the same steps then cost in
-  truth. In optimal control the cost falls by what is paid (Gruene and Rantzer, 2008,
-  section 3); where steps cost several times as much as was promised, the plan does not
-  lead where it says;
+* the *promise*: what the stages of a plan cost, without a weight of its end, and what
+  the same steps then cost in truth. In optimal control the cost falls by what is paid
+  (Gruene and Rantzer, 2008, section 3); where steps cost several times as much as was
+  promised, the plan does not lead where it says;
 * the *distance* from the reference in the cost's metric: a plant whose distance grows
-  faster and faster, against the promise, is lost;
+  faster and faster, against the promise or with plans that cost ever more, is lost;
 * *novelty*, as long as the reference is far away or the promise not kept; *violation*,
   failed solves, sensors that stand still and inputs that stay at a bound without
   effect.
@@ -32,9 +32,11 @@ import numpy as np
 
 from gpmpc.exceptions import ShapeError, UnsupportedModel
 from gpmpc.models._past import variances_of_next_row
-from gpmpc.mpc import _flight_checks as checks
-from gpmpc.mpc._controller import Decision, model_of
+from gpmpc.mpc import _flight_memory as memory
+from gpmpc.mpc._controller import Decision, model_of, steering_of
 from gpmpc.mpc._cost import Tracking
+from gpmpc.mpc._flight_checks import judge_step
+from gpmpc.mpc._question import first_weight
 from gpmpc.mpc.problem import Problem
 from gpmpc.signals import signals_of
 
@@ -108,7 +110,9 @@ class FlightJudge:
     For a robot of one's own as well as for ``closed_loop``.
 
     Args:
-        problem: What the controller makes small; its state weights measure distances.
+        problem: What the controller makes small; its state weights measure distances:
+            those of the first stage, where they are zero the mean ones, and where all
+            are that of the end. What weighs outputs alone measures none.
         noise: Variances (n,) of a next state that the covariances of plans leave out,
             as the model has learned them; zero by default.
         names: Of the states and of the inputs, for the reasons; by default their
@@ -140,21 +144,16 @@ class FlightJudge:
         if noise is not None:
             model_noise = _float64(noise)
             _check_shape("noise", model_noise.shape, (n,))
-        self._settings = checks.Settings(
-            weights=_float64(problem.cost.Q.reshape(-1, n, n)[0]),
-            terminal=_float64(problem.cost.terminal),
-            model_noise=model_noise,
-            angles=angles,
-            lower=_float64(lower),
-            upper=_float64(upper),
-        )
-        self._memory = checks.Memory(
-            states=checks.new_state_memory(n),
-            flight=checks.new_flight_memory(),
-            at_bound=np.zeros(m, dtype=np.int64),
-            distance_at_bound=np.zeros(m),
+        self._memory = memory.Memory(
+            states=memory.new_state_memory(model_noise, is_angle=angles),
+            inputs=memory.new_input_memory(_float64(lower), _float64(upper)),
+            weights=memory.weights_of(
+                stage=_stage_weight(problem.cost), end=_float64(problem.cost.terminal)
+            ),
+            flight=memory.new_flight_memory(),
         )
         self._constrained = bool(problem.constraints)
+        self._plans_hold_more = False  # states, behind those that are judged
         self._states = tuple(names[0]) or tuple(f"state {i}" for i in range(n))
         self._inputs = tuple(names[1]) or tuple(f"input {j}" for j in range(m))
         if len(self._states) != n or len(self._inputs) != m:
@@ -178,20 +177,27 @@ class FlightJudge:
         """Makes a judge of a controller's flights.
 
         It takes the controller's problem and the noise that its model has learned. Of a
-        controller without a problem no distance is judged. Names are by default its
-        own.
+        controller without a problem no distance is judged; of one whose problem is of
+        more states than ``state_dim``, the first are. Names are by default its own.
         """
         problem = getattr(controller, "problem", None)
         if not isinstance(problem, Problem):
             nothing = Tracking(Q=np.zeros(state_dim), R=np.ones(input_dim))
             problem = Problem(nothing)
+        is_constrained = bool(problem.constraints)
+        holds_more = problem.state_dim > state_dim
+        if holds_more:
+            problem = _of_first_states(problem, state_dim)
         if names is None:
             signals = signals_of(controller)
             names = (signals.state_names, signals.input_names)
         noise = _learned_noise(controller)
         if noise is not None:  # of a model with a past more than what is measured
             noise = noise[: problem.state_dim]
-        return cls(problem, noise, names)
+        judge = cls(problem, noise, names)
+        judge._constrained = is_constrained
+        judge._plans_hold_more = holds_more
+        return judge
 
     def judge(
         self,
@@ -232,8 +238,13 @@ class FlightJudge:
                 novelty = float(decision.plan_novelty)
             if self._constrained:
                 violation = float(decision.violation)
+        if self._plans_hold_more:
+            n = self._no_means.shape[1]
+            references = _float64(references[..., :n])
+            means = _float64(means[..., :n])
+            covariances = _float64(covariances[..., :n, :n])
         applied_input = self._unknown_input if input is None else _float64(input)
-        code = checks.MISFIT
+        code = memory.MISFIT
         has_right_axes = (
             measured.ndim == 1
             and references.ndim == 2
@@ -242,8 +253,7 @@ class FlightJudge:
             and applied_input.ndim == 1
         )
         if has_right_axes:  # else compiled code must not see them
-            code = checks.judge_step.unchecked(
-                self._settings,
+            code = judge_step.unchecked(
                 self._memory,
                 measured=measured,
                 reference=references,
@@ -254,9 +264,9 @@ class FlightJudge:
                 novelty=novelty,
                 violation=violation,
             )
-        if code == checks.HEALTHY:
+        if code == memory.HEALTHY:
             self.last = _ALL_WELL
-        elif code == checks.MISFIT:
+        elif code == memory.MISFIT:
             self._refuse_shapes(measured, references, means, covariances, applied_input)
         else:
             self.last = self._alarm_in_words()
@@ -289,11 +299,11 @@ class FlightJudge:
         reason = int(alarm["reason"])
         value = float(alarm["value"])
         sentence = _WORDS[reason]
-        if reason == checks.CLIMBING and value < 1.0:
+        if reason == memory.CLIMBING and value < 1.0:
             sentence = _CLIMBING_BELOW_THE_FIRST
-        if reason in (checks.AWAY, checks.RISING):
+        if reason in _LOST:
             return Judgement("lost", sentence.format(value=value))
-        names = self._inputs if reason == checks.SATURATED else self._states
+        names = self._inputs if reason == memory.SATURATED else self._states
         name = names[alarm["entry"]]
         return Judgement("suspicious", sentence.format(name=name, value=value))
 
@@ -303,8 +313,7 @@ def _learned_noise(controller: Any) -> Array | None:
 
     They are zero where its plans hold them; None where there is no such model.
     """
-    steering = getattr(controller, "controller", controller)  # of one that learns
-    prediction = getattr(steering, "prediction", None)
+    prediction = getattr(steering_of(controller), "prediction", None)
     model = model_of(controller)
     try:
         variances = variances_of_next_row(model)
@@ -320,6 +329,28 @@ def _learned_noise(controller: Any) -> Array | None:
     return variances
 
 
+def _of_first_states(problem: Problem, n: int) -> Problem:
+    """Returns what a problem weighs of its first n states, and its inputs' bounds."""
+    cost = problem.cost
+    first_cost = Tracking(
+        Q=cost.Q[..., :n, :n],
+        R=cost.R,
+        terminal=cost.terminal[:n, :n],
+        angles=[i for i in cost.angle_indices if i < n],
+    )
+    return Problem(first_cost, inputs=problem.inputs)
+
+
+def _stage_weight(cost: Tracking) -> Array:
+    """Returns the weight (n, n) by which distances are measured.
+
+    That of the first stage, or where that is zero the mean one; where all are, that of
+    the end.
+    """
+    weight = first_weight(cost.Q)
+    return _float64(weight if weight.any() else cost.terminal)
+
+
 _ALL_WELL = Judgement()
 
 
@@ -331,53 +362,59 @@ def _check_shape(name: str, got: tuple[int, ...], expected: tuple[int, ...]) -> 
 
 def _float64(values: Any) -> Array:
     """Returns values as a contiguous array of float64, without a copy if they are."""
-    is_plain = type(values) is Array and values.dtype is _FLOAT64
-    if is_plain and values.flags.c_contiguous:
-        return values
-    return np.ascontiguousarray(values, dtype=np.float64)
+    return np.asarray(values, dtype=_FLOAT64, order="C")  # in a third of a look at it
 
 
+_LOST = (memory.AWAY, memory.ESCAPING, memory.RISING)
 # The words for plans that cost more again, but less than the first one still.
 _CLIMBING_BELOW_THE_FIRST = (
     "the plans have stopped falling and rise: they cost {value:.2g} times as much as "
     "at first, although the model predicts well"
 )
 _WORDS = {
-    checks.INNOVATION: (
+    memory.INNOVATION: (
         "innovations of {name} are {value:.3g} standard deviations, "
-        f"root mean square of {checks.WINDOW} steps"
+        f"root mean square of {memory.WINDOW} steps"
     ),
-    checks.BIAS: (
+    memory.BIAS: (
         "innovations of {name} do not cancel each other: {value:.3g} standard "
-        f"deviations in the mean of {checks.BIAS_WINDOW} steps"
+        f"deviations in the mean of {memory.BIAS_WINDOW} steps"
     ),
-    checks.FROZEN: (
+    memory.FROZEN: (
         "{name} is measured the same for {value:.0f} steps while other states move"
     ),
-    checks.PROMISE: "steps cost {value:.3g} times what the plans promised",
-    checks.NOVELTY: (
+    memory.STILL: (
+        "{name} is measured the same for {value:.0f} steps, and so is every state, "
+        "without the noise that there was: no measurement is new"
+    ),
+    memory.PROMISE: "steps cost {value:.3g} times what the plans promised",
+    memory.NOVELTY: (
         "plans are far from the data: there the model knows little more than its prior"
     ),
-    checks.VIOLATION: (
+    memory.VIOLATION: (
         "plans miss a constraint, by {value:.3g} now, and no less with time"
     ),
-    checks.FAILURES: (
-        f"{{value:.0f}} of the last {checks.WINDOW} decisions could not be applied"
+    memory.FAILURES: (
+        f"{{value:.0f}} of the last {memory.WINDOW} decisions could not be applied"
     ),
-    checks.SATURATED: (
+    memory.SATURATED: (
         "{name} is at its bound for {value:.0f} steps, "
         "and the distance from the reference does not fall"
     ),
-    checks.AWAY: (
+    memory.AWAY: (
         "ever faster away from its reference, against what the plans promised; "
         "{value:.3g} from it, in the metric of the cost"
     ),
-    checks.CLIMBING: (
+    memory.ESCAPING: (
+        "ever faster away from its reference, and the plans cost ever more; "
+        "{value:.3g} from it, in the metric of the cost"
+    ),
+    memory.CLIMBING: (
         "the plans cost {value:.2g} times as much as at first and ever more, "
         "although the model predicts well"
     ),
-    checks.STANDING: "no nearer to the reference for {value:.0f} steps",
-    checks.RISING: (
+    memory.STANDING: "no nearer to the reference for {value:.0f} steps",
+    memory.RISING: (
         "the plans cost {value:.3g} times as much as at first and ever more, "
         "although the model predicts well: the horizon is too short for the plant"
     ),

@@ -191,8 +191,13 @@ def _novelty(added, noise, covariances, variances, ranges):
         for i in range(len(variances)):
             if variances[i] > 0.0:
                 ratio = (added[k, i, i] - noise[i]) / variances[i]
+                if ratio != ratio:  # what is no number is not known
+                    return np.inf
                 largest = max(largest, min(ratio, 1.0))
     for k in range(1, len(covariances)):
         for i in range(len(ranges)):
-            largest = max(largest, covariances[k, i, i] / ranges[i] ** 2)
+            ratio = covariances[k, i, i] / ranges[i] ** 2
+            if ratio != ratio:
+                return np.inf
+            largest = max(largest, ratio)
     return np.sqrt(largest)

@@ -73,5 +73,9 @@ def rows_over(parameters: Any, count: int) -> Array:
 
 
 def first_weight(weight: Array) -> Array:
-    """Returns the weight of the first stage, from one for all or those by stage."""
-    return weight.reshape(-1, *weight.shape[-2:])[0]
+    """Returns the weight of the first stage, from one for all or those by stage.
+
+    Where that is zero, as of a cost of the last stages alone, it is the mean of all.
+    """
+    by_stage = weight.reshape(-1, *weight.shape[-2:])
+    return by_stage[0] if by_stage[0].any() else by_stage.mean(axis=0)

@@ -573,3 +573,144 @@ def test_a_locked_input_is_not_at_its_bound():
         plan = replace(plan, input=inputs[0], inputs=inputs)
         judgement = judge.judge(plan.means[0], np.zeros(2), plan)
     assert "bound" not in judgement.reason
+
+
+def run_away(references, factor=1.2, model=None, start=1.0, count=120, Q=(1.0, 0.0)):
+    """Levels of a plant that grows by a factor a step, as its plans promise.
+
+    The model's factor is by default the plant's.
+    """
+    judge = FlightJudge(Problem(Tracking(Q, [0.01])))
+    powers = (factor if model is None else model) ** np.arange(21)
+    judged_levels = []
+    for k in range(count):
+        distance = start * factor**k
+        means = np.outer(distance * powers, [1.0, 0.0])
+        plan = replace(
+            plan_of(np.zeros(2)), means=means, covariances=np.zeros((21, 2, 2))
+        )
+        judgement = judge.judge(means[0], references(k), plan)
+        judged_levels.append(judgement.level)
+    return judged_levels, judgement
+
+
+@pytest.mark.parametrize("pace", [0.0, 0.001])
+@pytest.mark.parametrize("has_preview", [False, True])
+def test_a_plant_that_runs_away_is_lost_wherever_its_goal_goes(pace, has_preview):
+    ahead = np.arange(21 if has_preview else 1)
+
+    def references(k):
+        return np.outer(pace * (k + ahead), [1.0, 0.0])
+
+    judged_levels, _ = run_away(references)
+    assert "lost" in judged_levels[:50]
+
+
+def test_a_goal_that_moves_without_notice_is_no_alarm():
+    rng = np.random.default_rng(0)
+    judge = FlightJudge(CONTROLLER.problem)
+    goals = np.cumsum(rng.normal(0.0, 0.1, 200))
+    x = 0.0
+    for goal in goals:
+        plan = plan_of(np.zeros(2))
+        means = np.outer(goal + (x - goal) * 0.5 ** np.arange(6), [1.0, 0.0])
+        state = np.array([x, 0.001 * rng.normal()])
+        assert judge.judge(state, [goal, 0.0], replace(plan, means=means)).level == (
+            "healthy"
+        )
+        x = goal + 0.5 * (x - goal)
+
+
+def test_a_goal_that_moves_away_from_a_dead_plant_is_suspicious():
+    """Each plan explains why it still stands, and promises that it will follow."""
+    judge = FlightJudge(CONTROLLER.problem)
+    shares = 1.0 - 0.5 ** np.array([0, 0, 1, 2, 3, 4])
+    for k in range(60):
+        goal = 0.01 * k
+        plan = replace(plan_of(np.zeros(2)), means=np.outer(goal * shares, [1.0, 0.0]))
+        measured = (-1.0) ** k * np.array([0.001, 0.01])
+        judgement = judge.judge(measured, [goal, 0.0], plan)
+    assert judgement.level == "suspicious"
+
+
+def test_a_runaway_that_a_wrong_model_half_explains_is_lost():
+    judged_levels, judgement = run_away(lambda k: np.zeros(2), model=1.17, start=60.0)
+    assert judged_levels.index("lost") < 60
+    assert "and the plans cost ever more" in judgement.reason
+
+
+def test_a_weight_of_the_end_promises_nothing():
+    """It would be paid nowhere: steps have the weight of a stage."""
+    cost = Tracking([1.0, 0.0], [0.01], terminal=[100.0, 0.0])
+    judge = FlightJudge(Problem(cost))
+    covariances = np.tile(1e-4 * np.eye(2), (11, 1, 1))
+    means = np.outer(0.5 ** np.arange(11), [1.0, 0.0])
+    plan = replace(plan_of(np.zeros(2)), means=means, covariances=covariances)
+    for k in range(30):
+        judgement = judge.judge([1.2, 0.01 * (k % 2)], np.zeros(2), plan)
+    assert judgement.level == "suspicious"
+    flight = judge._memory.flight[0]
+    assert flight["paid"][:10].sum() == pytest.approx(14.4)
+    assert flight["promises"][0] == pytest.approx((0.25 ** np.arange(1, 11)).sum())
+
+
+@pytest.mark.parametrize("length", [20, 2000])
+def test_what_matters_does_not_grow_with_the_length_of_a_path(length):
+    judge = FlightJudge(CONTROLLER.problem)
+    for k in range(length + 60):
+        lag = 0.0 if k < length else 5.0
+        reference = np.outer(0.5 * (k + np.arange(6)), [1.0, 0.0])
+        measured = reference[0] - [lag, 0.01 * (k % 2)]
+        plan = replace(plan_of(np.zeros(2)), means=reference - [lag, 0.0])
+        judgement = judge.judge(measured, reference, replace(plan, input=np.ones(1)))
+    assert judgement.reason.startswith("input 0 is at its bound")
+
+
+@pytest.mark.parametrize("origin", [0.0, 5.5e6])
+def test_a_jump_of_a_sensor_is_one_wherever_the_origin_is(origin):
+    judge = FlightJudge(CONTROLLER.problem)
+    rng = np.random.default_rng(0)
+    for k in range(40):
+        measured = np.array([origin, 0.0]) + rng.normal(0.0, 1e-3, 2)
+        if k > 30:
+            measured[0] += 0.5
+        goal = np.array([origin, 0.0])
+        judgement = judge.judge(measured, goal, plan_of(np.array([origin, 0.0])))
+        assert k > 30 or judgement == Judgement()
+    assert judgement.reason.startswith("innovations of state 0")
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.0])
+@pytest.mark.parametrize("n", [1, 2])
+def test_sensors_that_all_freeze_at_once_are_named(noise, n):
+    """Without noise they may: the plant comes to rest."""
+    judge = FlightJudge(Problem(Tracking(np.ones(n), [0.01])), noise=np.full(n, 1e-4))
+    rng = np.random.default_rng(0)
+    plan = replace(plan_of(np.zeros(n)), covariances=np.zeros((6, n, n)))
+    for k in range(45):
+        resting = np.full(n, 0.25 ** min(k, 30))
+        moving = resting + rng.normal(0.0, 0.01, n)
+        frozen = np.full(n, 0.005)
+        measured = resting
+        if noise:
+            measured = moving if k < 30 else frozen
+        judgement = judge.judge(measured, np.zeros(n), plan)
+        if k < 38 or not noise:
+            assert judgement == Judgement()
+    assert ("no measurement is new" in judgement.reason) == (noise > 0.0)
+
+
+@pytest.mark.parametrize(
+    "cost",
+    [
+        Tracking(np.concatenate([np.zeros((4, 2, 2)), np.eye(2)[None]]), [0.01]),
+        Tracking([0.0, 0.0], [0.01], terminal=[1.0, 1.0]),
+    ],
+    ids=["last stage", "end"],
+)
+def test_distances_count_where_the_first_stage_weighs_none(cost):
+    judge = FlightJudge(Problem(cost, inputs=Box([-1.0], [1.0])))
+    for k in range(50):
+        plan = replace(plan_of(np.array([1.0, 0.0])), input=np.ones(1))
+        judgement = judge.judge([1.0, 0.01 * (k % 2)], np.zeros(2), plan)
+    assert judgement.reason.startswith("input 0 is at its bound")
