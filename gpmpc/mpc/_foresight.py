@@ -7,6 +7,7 @@ the goal is held.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
@@ -21,6 +22,7 @@ from gpmpc.models import RollOut
 from gpmpc.mpc._controller import Decision, Timing
 from gpmpc.mpc._question import Question, first_weight, hold_last
 from gpmpc.mpc._riccati import finite_horizon_lqr
+from gpmpc.mpc._sqp import FAILURES
 from gpmpc.mpc._stage_meter import CostSum, FlownCosts, StageMeter
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Problem
@@ -246,7 +248,10 @@ class Foresight:
             inputs = np.tile(controller.initial_input, (self.longest, 1))
             inputs[0, j] = upper[j]
             centre = np.tile(state, (self.longest + 1, 1))
-            states, inputs = self.roll_out(centre, inputs, gains, state, question)
+            try:
+                states, inputs = self.roll_out(centre, inputs, gains, state, question)
+            except FAILURES:
+                continue
             if not np.isfinite(states).all():
                 continue
             for last in _swings(self.meter(states, inputs, question).weighed):
@@ -264,11 +269,14 @@ class Foresight:
         For ``dearest`` see ``arrives``.
         """
         assert flight.gains is not None
-        states, inputs = self.roll_out(
-            flight.states, flight.inputs, flight.gains, state, question
-        )
+        states = np.full_like(flight.states, np.nan)
+        inputs = flight.inputs
         costs = FlownCosts.unknown(len(inputs))
         arrives = False
+        with suppress(*FAILURES):
+            states, inputs = self.roll_out(
+                flight.states, flight.inputs, flight.gains, state, question
+            )
         if np.isfinite(states).all():
             costs = self.meter(states, inputs, question)
             arrives = self.arrives(costs, dearest)
@@ -316,11 +324,16 @@ class Foresight:
     def with_gains(self, flight: ModelFlight, question: Question) -> ModelFlight:
         """Returns a flight with the gains of the regulator of its own stages.
 
-        Outputs weigh as they do along it.
+        Outputs weigh as they do along it. Stages up to one at which the model has no
+        slopes are flown without feedback.
         """
-        local = linearize(
-            self._model, flight.states[:-1], flight.inputs, covariance=False
-        )
+        no_gains = np.zeros((*flight.inputs.shape, flight.states.shape[1]))
+        try:
+            local = linearize(
+                self._model, flight.states[:-1], flight.inputs, covariance=False
+            )
+        except FAILURES:
+            return replace(flight, gains=no_gains)
         problem = self.controller.prediction.problem
         cost = problem.cost
         Q = first_weight(cost.Q)[None]
@@ -343,7 +356,8 @@ class Foresight:
             np.ascontiguousarray(terminal),
             len(flight),
         )[0]
-        return replace(flight, gains=gains)
+        has_numbers = np.isfinite(gains).all(axis=(1, 2), keepdims=True)
+        return replace(flight, gains=np.where(has_numbers, gains, 0.0))
 
     def improve(
         self,
@@ -443,7 +457,10 @@ class _GrowingFlight:
         )
         if not plan.applicable:
             return False
-        next_state = self._foresight.step(state, plan.input, self._question)
+        try:
+            next_state = self._foresight.step(state, plan.input, self._question)
+        except FAILURES:
+            return False
         question = self._question.after(self.stages)
         question = question._replace(previous_input=self._last_input)
         costs = self._foresight.meter(

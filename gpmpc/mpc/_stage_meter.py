@@ -8,6 +8,7 @@ What is weighed and what is violated stand apart: beside an exact price of 1e6 w
 nothing else would be seen, where shares of a cost are compared.
 """
 
+import math
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -148,20 +149,29 @@ class _Horizon(NamedTuple):
 class StageMeter:
     """Measures what stages cost, outputs and violated constraints included.
 
-    Weights are those of the first stage, wherever a stage stands, of outputs as well:
-    what is weighed at the end alone is left out. Angles count within half a turn.
-    Constraints of a part of the horizon only do not count.
+    Weights, references of outputs and bounds are those of the first stage, wherever a
+    stage stands: what is weighed at the end alone is left out, unless the first stage
+    weighs nothing. Angles count within half a turn. Constraints of a part of the
+    horizon only do not count.
     """
 
     def __init__(self, problem: Problem, horizon: int):
-        self._problem = problem
+        cost = problem.cost
+        self._cost = replace(cost, Q=first_weight(cost.Q), R=first_weight(cost.R))
         self._horizon = horizon
         self._outputs = [
-            replace(output, weight=first_weight(output.weight))
+            replace(
+                output,
+                weight=first_weight(output.weight),
+                reference=np.atleast_2d(output.reference)[0],
+            )
             for output in problem.outputs
         ]
         self._rows = ConstraintRows(problem, horizon, "none")
         self._always = self._rows.applies.all(axis=0)
+        self._declared = np.ones(self._rows.per_stage, dtype=bool)  # not linearised
+        for smooth in self._rows.smooth_rows:
+            self._declared[smooth.columns] = False
 
     def __call__(self, states: Array, inputs: Array, question: Question) -> FlownCosts:
         """Returns the costs of states (L + 1, n) and inputs (L, m).
@@ -173,7 +183,7 @@ class StageMeter:
         reference_inputs = None
         if reference.inputs is not None:
             reference_inputs = hold_last(np.asarray(reference.inputs), count)
-        paid = self._problem.cost.paid_parts(
+        paid = self._cost.paid_parts(
             states=states,
             inputs=inputs,
             references=hold_last(np.asarray(reference.states), count + 1),
@@ -210,6 +220,21 @@ class StageMeter:
             outputs[first:end] = output_costs[: end - first]
             violations[first:end] = violation_costs[: end - first]
         return outputs, violations
+
+    def largest_excess(self, states: Array, inputs: Array, parameters: Any) -> float:
+        """Returns by how much constraints are missed at most, in their own units.
+
+        NaN where a function or its slope is not finite.
+        """
+        if not self._always.any():
+            return 0.0
+        try:
+            return max(
+                float(self._excess(stages).max())
+                for stages in self._horizons(states, inputs, parameters)
+            )
+        except FunctionNotFinite:
+            return math.nan
 
     def output_weights(self, states: Array, inputs: Array, parameters: Any) -> Array:
         """Returns the weights Z (L, n + m + 1, n + m + 1) of [x_{k+1}; u_k; 1].
@@ -271,20 +296,27 @@ class StageMeter:
         """
         if not self._rows.per_stage:
             return np.zeros(self._horizon)
+        excess = self._excess(stages)
+        prices = self._rows.prices[self._always]
+        hard = np.isinf(prices)
+        costs = (excess[:, ~hard] - KEPT).clip(0.0) @ prices[~hard]
+        costs[(excess[:, hard] > FEASIBLE).any(axis=1)] = np.inf
+        return costs
+
+    def _excess(self, stages: _Horizon) -> Array:
+        """Returns by how much constraints of all stages are missed (H, r)."""
         states = stages.next_states
         inputs = stages.inputs
         n = states.shape[1]
         certain = np.zeros((self._horizon + 1, n, n))
+        # No row is of x_0: any state may stand in its place.
         plan = Plan(np.vstack([states[:1], states]), inputs, certain)
         rows = self._rows.at(plan, certain, 1, stages.parameters)
         E = np.broadcast_to(rows.E, (self._horizon, *rows.E.shape[1:]))
         values = np.einsum("kri,ki->kr", E, states)
         if len(rows.D):
             values += np.einsum("kri,ki->kr", rows.D, inputs)
-        excess = np.maximum(values - rows.upper, rows.lower - values).clip(0.0)
-        excess = excess[:, self._always]
-        prices = self._rows.prices[self._always]
-        hard = np.isinf(prices)
-        costs = (excess[:, ~hard] - KEPT).clip(0.0) @ prices[~hard]
-        costs[(excess[:, hard] > FEASIBLE).any(axis=1)] = np.inf
-        return costs
+        lower = np.where(self._declared, rows.lower[:1], rows.lower)
+        upper = np.where(self._declared, rows.upper[:1], rows.upper)
+        excess = np.maximum(values - upper, lower - values).clip(0.0)
+        return excess[:, self._always]

@@ -17,6 +17,7 @@ from gpmpc.exceptions import (
     check_numbers,
 )
 from gpmpc.mpc._controller import Array, Reference
+from gpmpc.mpc._sqp import FAILURES
 from gpmpc.mpc.gp_mpc import GPMPC
 from gpmpc.mpc.problem import Problem
 
@@ -75,7 +76,10 @@ class Starts:
                 yield self._line(state, goal)
             else:
                 inputs = np.asarray(guess, dtype=float)
-                states = self._planner.prediction.lead(state, inputs)
+                try:
+                    states = self._planner.prediction.lead(state, inputs)
+                except FAILURES:  # it leads the model out of its numbers
+                    continue
                 yield Start(goal, inputs=guess, states=states)
 
     def _line(self, state: Array, goal: Reference) -> Start:

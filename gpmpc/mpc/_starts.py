@@ -16,7 +16,6 @@ as a whole, and followed under its feedback.
     arguments     those of ``control`` at one step                  (``_StepArguments``)
 """
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cmp_to_key
@@ -31,7 +30,8 @@ import torch
 from gpmpc._angles import full_turns
 from gpmpc._arrays import is_measured
 from gpmpc._calls import explains_arguments
-from gpmpc.exceptions import SettingError, check_kind, check_number
+from gpmpc._dynamics import to_array
+from gpmpc.exceptions import SettingError, ShapeError, check_kind, check_number
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc._controller import (
     Array,
@@ -73,7 +73,7 @@ class _StepArguments(NamedTuple):
     @property
     def state(self) -> Array:
         """Mean of the belief (n,)."""
-        return self.belief.mean.numpy()
+        return to_array(self.belief.mean)
 
     @property
     def end(self) -> Array:
@@ -372,12 +372,19 @@ class ManyStarts:
         check_arguments(belief, reference)
         belief = belief.in_order(self.signals.state_names)
         reference = reference.in_order(self.signals).over(self.horizon)
-        state = belief.mean.numpy()
+        state = to_array(belief.mean)
+        if state.shape != np.shape(reference.states)[1:]:
+            got = f"{state.shape} and {np.shape(reference.states)}"
+            raise ShapeError(
+                f"state and reference must be of as many states; got {got}"
+            )
         if not is_measured(state).all():
             return self.controller.control(belief, reference, previous, parameters)
         if previous is not None and self._can_continue(previous):
             turns = full_turns(state - previous.means[1], self._angles)
-            belief = replace(belief, mean=belief.mean - torch.as_tensor(turns))
+            belief = replace(
+                belief, mean=belief.mean - torch.tensor(turns).to(belief.mean)
+            )
         arguments = _StepArguments(belief, reference, previous, parameters)
         if self._judges_flights and _is_set_point(reference):
             return self._follow_flight(arguments)
@@ -395,7 +402,7 @@ class ManyStarts:
 
         Each comes with its criterion, infinite if it is not applicable.
         """
-        starts = self.starts.of(belief.mean.numpy(), reference.over(self.horizon))
+        starts = self.starts.of(to_array(belief.mean), reference.over(self.horizon))
         for start in islice(starts, first, None):
             decision = self.planner.control(
                 belief,
@@ -454,7 +461,6 @@ class ManyStarts:
         is no longer than a horizon, the controller's own plans are.
         """
         question = self._read_question(arguments)
-        # Of the last decision's step, until ``after_flown_stage``.
         pursuit = self._last_pursuit(arguments)
         current = None  # what is left of the flight that was followed
         if pursuit is not None and pursuit.flight is not None:
@@ -561,7 +567,9 @@ class ManyStarts:
         previous = arguments.previous
         if not isinstance(previous, _FollowedDecision) or previous.pursuit is None:
             return None
-        if not np.array_equal(previous.pursuit.goal, arguments.end):
+        # What a reference holds of a model's past moves on with it, and is no goal.
+        n = self.problem.state_dim
+        if not np.array_equal(previous.pursuit.goal[:n], arguments.end[:n]):
             return None
         return previous.pursuit.after_failed_steps(previous, self.horizon)
 
@@ -596,9 +604,10 @@ class ManyStarts:
             question.parameters,
             plan=(inputs, means),
         )
-        return _FollowedDecision.of(
-            self._with_plan(decision, inputs, means, arguments.previous), pursuit
+        followed = self._with_plan(
+            decision, inputs, means, arguments.previous, question.parameters
         )
+        return _FollowedDecision.of(followed, pursuit)
 
     def _search_flight(
         self, arguments: _StepArguments, question: Question, current: ModelFlight | None
@@ -624,7 +633,8 @@ class ManyStarts:
         best = search.best()
         if best is None:
             return None
-        return self._foresight.follow(best, arguments.state, question)
+        flight = self._foresight.follow(best, arguments.state, question)
+        return flight if np.isfinite(flight.states).all() else None
 
     def _controller_beginnings(self, arguments: _StepArguments) -> Iterator[Trajectory]:
         """Makes beginnings of the controller by itself.
@@ -660,11 +670,11 @@ class ManyStarts:
             if not self.planner.prediction.settings.rolled_out:
                 try:
                     gains = self.planner.gains(decision, question.parameters)
-                except FAILURES:  # where the model has no slopes
+                    states, inputs = foresight.roll_out(
+                        states, inputs, gains, state, question
+                    )
+                except FAILURES:  # where the model has no slopes, or no numbers
                     continue
-                states, inputs = foresight.roll_out(
-                    states, inputs, gains, state, question
-                )
             if np.isfinite(states).all():
                 yield states, inputs
         yield from foresight.relays(state, question)
@@ -710,16 +720,18 @@ class ManyStarts:
             means=shifted_means,
             covariances=one_step_on(previous.covariances),
         )
+        question = self._read_question(arguments._replace(reference=goal))
         try:
             gains = self.controller.gains(shifted, arguments.parameters)
-        except FAILURES:  # where the model has no slopes
+            rolled_states, rolled_inputs = self._foresight.roll_out(
+                shifted_means, shifted_inputs, gains, arguments.state, question
+            )
+        except FAILURES:  # where the model has no slopes, or no numbers
             return decision
-        question = self._read_question(arguments._replace(reference=goal))
-        rolled_states, rolled_inputs = self._foresight.roll_out(
-            shifted_means, shifted_inputs, gains, arguments.state, question
-        )
         if plan_cost(rolled_states, rolled_inputs) < limit:
-            return self._with_plan(decision, rolled_inputs, rolled_states, previous)
+            return self._with_plan(
+                decision, rolled_inputs, rolled_states, previous, arguments.parameters
+            )
         return decision
 
     def _with_plan(
@@ -728,11 +740,13 @@ class ManyStarts:
         inputs: Array,
         means: Array,
         previous: Decision | None,
+        parameters: Any,
     ) -> Decision:
         """Returns a decision for another plan, which is applicable.
 
-        Where the controller itself failed, its status says so, and the covariances are
-        those of the last plan: they depend on the time since the last measurement.
+        Its violation is that of its means, by constraints of all stages. Where the
+        controller itself failed, its status says so, and the covariances are those of
+        the last plan: they depend on the time since the last measurement.
         """
         covariances = decision.covariances
         if not decision.applicable:
@@ -746,7 +760,7 @@ class ManyStarts:
             means=means,
             covariances=covariances,
             stage_costs=np.empty(0),
-            violation=math.nan,
+            violation=self._foresight.meter.largest_excess(means, inputs, parameters),
             steps=(),
             plan_novelty=self.controller.novelty_when_read(means, inputs, covariances),
         )
@@ -787,7 +801,10 @@ class ManyStarts:
         return inf if self.budget is None else perf_counter() + self.budget
 
     def _cost(self, decision: Decision, reference: Reference) -> float:
-        """Returns the cost of a decision's plan from its first input on."""
+        """Returns the cost of a decision's plan, its first increment left out.
+
+        It is the ``criterion`` by default, for users that ask for it.
+        """
         return self._plan_cost(
             decision.means,
             decision.inputs,

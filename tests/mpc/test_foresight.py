@@ -140,6 +140,23 @@ def test_a_hard_bound_costs_infinity_unless_it_is_of_few_stages():
     assert np.isfinite(costs[1]).all()
 
 
+def test_a_stage_costs_the_same_wherever_it_stands():
+    """Bounds and references by stage count as those of the first one."""
+    narrower = Box(upper=[[1.2, np.inf], [0.4, np.inf]], penalty=2.0)
+    outputs = LeastSquares(lambda x: x[:, :1], [1.0], reference=[[0.3], [0.9]])
+    late = Tracking([[[0.0, 0.0]] * 2, np.eye(2)], [0.01], penalized="inputs")
+    problem = Problem(
+        late, Box([-2.0], [2.0]), constraints=[narrower], outputs=[outputs]
+    )
+    meter = StageMeter(problem, 2)
+    states = np.zeros((6, 2))
+    states[1:, 0] = 1.0
+    asked = question(Reference(np.zeros((3, 2))))
+    costs = meter(states, np.zeros((5, 1)), asked)
+    assert costs.errors == pytest.approx(np.full(5, 0.7**2 + 0.5))
+    assert not costs.violations.any()
+
+
 def test_a_flight_follows_the_controller_and_ends_at_the_goal():
     system = pendulum()
     one = controller(system, pendulum_problem(), 30)

@@ -13,7 +13,7 @@ import torch
 
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
-from gpmpc.models import CasadiFunction, KnownModel
+from gpmpc.models import CasadiFunction, DelayedModel, KnownModel
 from gpmpc.mpc import (
     GPMPC,
     Box,
@@ -717,3 +717,53 @@ def test_a_planner_of_another_horizon_is_refused():
     longer = controller(pendulum(), [1.0, 0.01], [0.01], 12)
     with pytest.raises(SettingError, match=r"planner: .* horizon, 10; got 12"):
         ManyStarts(one, longer, guesses=[None])
+
+
+def test_a_flight_of_a_model_with_a_past_is_followed():
+    """What is added to its references moves on with the past, and is no goal."""
+    late = DelayedModel(known_model(pendulum()), 1)
+    cost = Tracking([1.0, 0.01], [0.01], penalized="inputs", angles=(0,))
+    settings = PredictionSettings(covariance="none", rolled_out=True)
+    problem = Problem(cost, inputs=Box([-2.0], [2.0]))
+    one = GPMPC(late, Linearization(), problem, 20, [0.0], settings, iterations=3)
+    many = CountedStarts(one, guesses=[None])
+    fly(many, pendulum(), 3)
+    assert many.searches == 1
+
+
+def test_a_flight_through_a_state_without_slopes_is_flown():
+    """An empty tank: the root of its level has a value there, and no slope."""
+
+    def fill(x, u):
+        return x + 0.1 * (u - torch.sqrt(torch.clamp(x, min=0.0)))
+
+    problem = Problem(Tracking([1.0], [0.01]), inputs=Box([0.0], [2.0]))
+    settings = PredictionSettings(covariance="none", rolled_out=True)
+    one = GPMPC(KnownModel(fill, 1, 1), Linearization(), problem, 5, [0.0], settings)
+    loop = ControlLoop(ManyStarts(one))
+    assert 0.0 <= loop.input(np.zeros(1), np.array([0.5]))[0] <= 2.0
+
+
+def test_a_followed_flight_says_what_it_misses():
+    wall = Box([-9.0, -0.5], [9.0, 0.5], penalty=1.0)
+    one = controller(pendulum(), [1.0, 0.01], [0.01], 20, constraints=[wall])
+    loop = ControlLoop(ManyStarts(one, guesses=[None]))
+    state = np.array([np.pi, 0.0])
+    for _ in range(2):
+        state = step(pendulum(), state, loop.input(state, np.zeros(2)))
+    plan = loop.last.decision
+    missed = np.abs(plan.means[1:, 1]).max() - 0.5
+    assert missed > 0.1
+    assert plan.violation == pytest.approx(missed)
+
+
+def test_beliefs_that_gradients_run_through_are_beliefs():
+    """``numpy()`` of such a tensor fails, as of one on another device."""
+    many = pendulums(1)
+    mean = torch.zeros(2, dtype=torch.float64, requires_grad=True)
+    belief = Gaussian(mean, torch.zeros(2, 2, dtype=torch.float64))
+    reference = Reference(np.zeros(2))
+    first = many.control(belief, reference)
+    assert many.control(belief, reference, first).applicable
+    with pytest.raises(ShapeError, match="state and reference must be of as many"):
+        many.control(belief, Reference(np.zeros(3)))
