@@ -8,8 +8,9 @@ import numpy as np
 from scipy.linalg import eig, matrix_balance
 
 from gpmpc._dynamics import DynamicsModel, linearize, to_array
+from gpmpc.exceptions import UnsupportedModel
 from gpmpc.models import DelayedModel
-from gpmpc.mpc._linear_quadratic import INCREMENTS, QuadraticCost
+from gpmpc.mpc._linear_quadratic import INCREMENTS
 from gpmpc.mpc._linearization import PredictionModel, PredictionSettings
 from gpmpc.mpc._rest_points import RestPoint, pending_inputs
 from gpmpc.mpc._riccati import finite_horizon_lqr
@@ -67,7 +68,7 @@ class LinearLoop:
         self._model: Any = plant or ahead or prediction.model
         self._tolerance = _LEARNED if _has_noise(self._model) else _ROUNDING
         self._plant = _linear_plant(prediction, point, plant, ahead)
-        self._laws = _laws(point.A, point.B, point.cost, prediction.horizon)
+        self._laws = _laws(point, prediction.horizon)
 
     @property
     def constant(self) -> bool:
@@ -81,8 +82,7 @@ class LinearLoop:
 
     def look_ahead(self, horizon: int) -> None:
         """Computes the laws of all horizons up to one."""
-        point = self._point
-        self._laws = _laws(point.A, point.B, point.cost, horizon)
+        self._laws = _laws(self._point, horizon)
 
     def radius(
         self, horizon: int, gain: float = 1.0, disturbance_gain: float | None = None
@@ -205,7 +205,10 @@ def _has_noise(model: Any) -> bool:
 
     What is around may count that noise among its predictions.
     """
-    noise = getattr(model, "noise_covariance", None)
+    try:
+        noise = getattr(model, "noise_covariance", None)
+    except UnsupportedModel:  # it depends on the state
+        return True
     if noise is not None and to_array(noise).any():
         return True
     within = getattr(model, "model", None)
@@ -220,12 +223,15 @@ class _Law(NamedTuple):
     by_last_input: Array
 
 
-def _laws(A: Array, B: Array, cost: QuadraticCost, horizon: int) -> list[_Law]:
+def _laws(point: RestPoint, horizon: int) -> list[_Law]:
     """Returns the laws of the horizons from ``horizon`` down to 1.
 
     They are those of the regulator of (s, d, u_{-1}). The disturbance is added to the
-    state at every stage, and nothing weighs it.
+    state at every stage, and nothing weighs it. Inputs that are held do not move.
     """
+    A = point.A
+    B = point.B
+    cost = point.cost
     n, m = B.shape
     none = np.zeros((n, n))
     kept_input = np.zeros((m, m))  # how much of u_{-1} a stage's input goes on from
@@ -239,8 +245,14 @@ def _laws(A: Array, B: Array, cost: QuadraticCost, horizon: int) -> list[_Law]:
         ]
     )
     effect = np.vstack([B, np.zeros((n, m)), np.eye(m)])
+    effect[:, point.is_held] = 0.0
+    input_weights = _of_stages(cost.input, horizon).copy()
+    input_weights[:, point.is_held] = 0.0
+    input_weights[:, :, point.is_held] = 0.0
+    input_weights[:, point.is_held, point.is_held] = 1.0
     squares = _of_stages(cost.squares, horizon)
-    # The cost weighs s_1 .. s_{H-1}, the regulator s_0 .. s_{H-1}.
+    # The cost weighs s_1 .. s_{H-1}, the regulator s_0 .. s_{H-1}: s_0 is given, and
+    # its weight says nothing of the law.
     weights_of_next = np.stack(
         [
             _wide(Q, squares[i : i + 1])
@@ -254,7 +266,7 @@ def _laws(A: Array, B: Array, cost: QuadraticCost, horizon: int) -> list[_Law]:
         transition[None],
         effect[None],
         weights,
-        _of_stages(cost.input, horizon),
+        input_weights,
         _wide(cost.terminal[0], squares[-1:]),
         horizon,
     )[0]

@@ -11,11 +11,12 @@ from gpmpc._dynamics import linearize
 from gpmpc.models import DelayedModel
 from gpmpc.models._past import has_past
 from gpmpc.models._wrapper import Wrapper
-from gpmpc.mpc._controller import Reference, read_parameters
-from gpmpc.mpc._cost import FunctionNotFinite
+from gpmpc.mpc._controller import KEPT, Reference, read_parameters
 from gpmpc.mpc._linear_quadratic import DEVIATIONS, INCREMENTS, Plan, QuadraticCost
 from gpmpc.mpc._linearization import PredictionModel
 from gpmpc.mpc._novelty import data_scales
+from gpmpc.mpc._sqp import FAILURES
+from gpmpc.mpc._stage_meter import StageMeter
 
 Array = np.ndarray
 
@@ -26,6 +27,7 @@ _ROUNDING = 1e-6  # relative rise of a value that counts as none
 _SETTLED = 1e-3  # last change of a point of rest, relative to its size
 _AT_REST = 1e-2  # largest step of a state at rest, likewise: learned models drift
 _NEGLIGIBLE = 1e-3  # weight of what no cost weighs, in the largest one
+_LAST_DIGITS = 1e-9  # of a state, which arithmetic may lose
 _PRICE = 1e3  # of a state that does not rest, in the largest weight
 
 
@@ -36,6 +38,7 @@ class RestPoint(NamedTuple):
     input: Array  # (m,)
     A: Array  # (n, n) of the model there
     B: Array  # (n, m)
+    is_held: Array  # which inputs are at a bound there, or locked (m,)
     cost: QuadraticCost
 
 
@@ -44,9 +47,13 @@ def rest_points(
 ) -> list[RestPoint]:
     """Returns the points at which the law can be judged.
 
-    They are those of a set point, or of some steps of a trajectory; without those whose
-    functions are not finite, and those that no input within the bounds holds.
+    They are those of a set point, or of some steps of a trajectory; without those where
+    a function or the model has no numbers, those at which all inputs are at their
+    bounds, and those that miss a constraint.
     """
+    if parameters is not None:
+        read_parameters(parameters, prediction.horizon)
+    meter = StageMeter(prediction.problem, prediction.horizon)
     states = np.atleast_2d(np.asarray(reference.states, dtype=float))
     inputs = _reference_inputs(reference, (len(states), prediction.problem.input_dim))
     steps = np.zeros_like(states)  # of the reference; none at its end
@@ -67,11 +74,17 @@ def rest_points(
             target_input=input,
             parameters=parameters,
         )
-        with suppress(FunctionNotFinite):
+        with suppress(*FAILURES):
             point = search.find()
-            if point is not None:
+            if point is not None and _keeps_constraints(point, meter, parameters):
                 points.append(point)
     return points
+
+
+def _keeps_constraints(point: RestPoint, meter: StageMeter, parameters: Any) -> bool:
+    """Tells whether a point keeps the constraints of all stages."""
+    states = np.tile(point.state, (2, 1))
+    return meter.largest_excess(states, point.input[None], parameters) <= KEPT
 
 
 def _reference_inputs(reference: Reference, shape: tuple[int, int]) -> Array:
@@ -144,20 +157,23 @@ class _RestSearch:
     def find(self) -> RestPoint | None:
         """Returns the point, by Gauss-Newton steps from the target on.
 
-        None where they find none within the input's bounds.
+        Inputs stay within their bounds. None where no step leads to rest, or where no
+        input is free to move.
         """
         prediction = self._prediction
         n = len(self._target)
-        input = prediction.initial_input.copy()
+        lower, upper = prediction.problem.inputs.first
+        input = prediction.initial_input.clip(lower, upper)
         state = self._target.copy()
         pending = pending_inputs(prediction.model)
         state[pending] = np.tile(input, len(pending) // len(input))
+        start = np.concatenate([state, input])
         current = self._at(state, input)
         least_sizes = self._least_sizes(current)
         for _ in range(_ITERATIONS):
             if not math.isfinite(current.value):
                 return None
-            change = -np.linalg.solve(current.hessian, current.gradient)
+            change = _step_within(current, lower - input, upper - input)
             candidate = self._at(state + change[:n], input + change[n:])
             for _ in range(_HALVINGS):
                 if candidate.value <= current.value * (1.0 + _ROUNDING):
@@ -167,16 +183,29 @@ class _RestSearch:
             state = state + change[:n]
             input = input + change[n:]
             current = candidate
-            sizes = np.maximum(least_sizes, np.abs(np.concatenate([state, input])))
+            # Sizes are those of ways: where zero is says nothing of them.
+            way = np.abs(np.concatenate([state, input]) - start)
+            sizes = np.maximum(least_sizes, way)
+            # A step that does not improve was halved until it is small: it ends here.
             if (np.abs(change) <= _SETTLED * sizes).all():
                 break
-        lower, upper = prediction.problem.inputs.first
-        within = (lower < input) & (input < upper)
-        state_sizes = np.maximum(least_sizes[:n], np.abs(state))
-        rests = np.abs(current.defect) <= _AT_REST * state_sizes
-        if not (within.all() and rests.all()):
+        is_held = (input <= lower) | (input >= upper)
+        largest_defects = _AT_REST * self._state_ranges(sizes[:n])
+        largest_defects += _LAST_DIGITS * np.abs(state)
+        rests = np.abs(current.defect) <= largest_defects
+        if is_held.all() or not rests.all():
             return None
-        return RestPoint(state, input, A=current.A, B=current.B, cost=current.cost)
+        return RestPoint(
+            state, input, A=current.A, B=current.B, is_held=is_held, cost=current.cost
+        )
+
+    def _state_ranges(self, sizes: Array) -> Array:
+        """Returns sizes of states (n,), no less than their ranges in the data."""
+        scales = data_scales(self._prediction.model)
+        if scales is None:
+            return sizes
+        has_range = np.isfinite(scales.ranges)
+        return np.where(has_range, np.maximum(sizes, scales.ranges), sizes)
 
     def _least_sizes(self, start: _Unrest) -> Array:
         """Returns sizes (n + m,) that states and inputs near zero have all the same.
@@ -244,6 +273,28 @@ class _RestSearch:
             gradient=gradient,
             value=value,
         )
+
+
+def _step_within(current: _Unrest, lowest: Array, highest: Array) -> Array:
+    """Returns the step (n + m,) to the least value, of inputs between two bounds (m,).
+
+    Inputs that a step takes beyond a bound are held there, for the rest of this step.
+    """
+    unbounded = np.full(len(current.A), np.inf)
+    least = np.concatenate([-unbounded, lowest])
+    most = np.concatenate([unbounded, highest])
+    step = np.zeros(len(least))
+    is_free = np.ones(len(least), dtype=bool)
+    for _ in range(len(lowest) + 1):
+        gradient = current.gradient + current.hessian @ np.where(is_free, 0.0, step)
+        hessian = current.hessian[np.ix_(is_free, is_free)]
+        step[is_free] = -np.linalg.solve(hessian, gradient[is_free])
+        is_beyond = (step < least) | (step > most)
+        if not is_beyond.any():
+            break
+        step = step.clip(least, most)
+        is_free &= ~is_beyond
+    return step
 
 
 def _reachable_ranges(A: Array, B: Array, input_ranges: Array, horizon: int) -> Array:

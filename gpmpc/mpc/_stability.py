@@ -32,9 +32,9 @@ from typing import Any
 import numpy as np
 
 from gpmpc._dynamics import DynamicsModel
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.models import DelayedModel
-from gpmpc.mpc._controller import read_reference
+from gpmpc.mpc._controller import Reference, read_reference
 from gpmpc.mpc._linear_loop import LinearLoop, observer_gain
 from gpmpc.mpc._linearization import PredictionModel
 from gpmpc.mpc._rest_points import pending_inputs, rest_points
@@ -58,7 +58,7 @@ class Stability:
     horizon: int  #: H, of the controller
     #: the largest size of an eigenvalue of the closed loop: above 1 it does not settle;
     #: NaN where no point could be judged: the model rests nowhere near the reference
-    #: within the bounds of the inputs
+    #: within the bounds of inputs and states
     spectral_radius: float
     #: whether no mode grows: integrators that nothing weighs may stand still. Of a
     #: learned model growth counts above 0.1 % a step, since its integrators are not
@@ -79,7 +79,8 @@ class Stability:
     #: does; NaN where one does without an estimate, too
     safe_disturbance_gain: float
     states: Array  #: the points that were judged (K, n)
-    inputs: Array  #: the inputs that hold them (K, m)
+    #: the inputs that hold them (K, m); those at a bound count as held
+    inputs: Array
 
     @property
     def judged(self) -> bool:
@@ -119,6 +120,7 @@ def stability(
 ) -> Stability:
     """Returns what a loop does near its reference; see ``GPMPC.stability``."""
     followed = read_reference(reference).in_order(prediction.stated_signals)
+    _check_reference(followed, prediction)
     _check(prediction, plant, ahead)
     horizon = prediction.horizon
     problem = prediction.stated_problem
@@ -181,6 +183,17 @@ def _safe_disturbance_gain(
         else:
             unsafe = middle
     return math.floor(100.0 * _SPARE * safe) / 100.0
+
+
+def _check_reference(reference: Reference, prediction: PredictionModel) -> None:
+    """Raises ``ShapeError`` or ``DataError`` unless it is finite and of the states."""
+    states = np.asarray(reference.states, dtype=float)
+    n = prediction.stated_problem.state_dim
+    if states.shape[-1] not in (n, prediction.model.state_dim):
+        rule = f"must be ({n},) or (K, {n})"
+        raise ShapeError(f"reference states {rule}; got {states.shape}")
+    if not np.isfinite(states).all():
+        raise DataError("reference states must be finite")
 
 
 def _check(

@@ -493,6 +493,8 @@ class GPMPC:
 
         Raises:
             SettingError: The plant or the delay does not belong to the controller.
+            ShapeError: A reference of another number of states.
+            DataError: One that is not finite.
         """
         return stability(self.prediction, reference, plant, ahead, parameters)
 

@@ -5,11 +5,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from gpmpc._dynamics import DynamicsModel
 from gpmpc.exceptions import GpmpcError
 from gpmpc.mpc import GPMPC, Reference, beyond_data
+from gpmpc.mpc._sqp import LINEAR_ALGEBRA_FAILURES
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ def outlook(
     controller = getattr(controller, "source", controller)  # of compiled code
     if isinstance(controller, GPMPC):
         # What cannot be judged, such as outputs of parameters, is no reason not to fly.
-        with suppress(GpmpcError, np.linalg.LinAlgError):
+        with suppress(GpmpcError, *LINEAR_ALGEBRA_FAILURES):
             stability = controller.stability(reference)
     if stability is None:
         return Outlook(warnings=tuple(far_from_data))

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from benchmarks.horizons import TANK_GOAL, VOLTAGES, quadruple_tank, true_model
-from gpmpc.exceptions import SettingError
+from gpmpc.exceptions import DataError, SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions
 from gpmpc.models import (
@@ -376,3 +376,91 @@ def test_what_moves_on_is_no_rest_in_any_unit(micrometre, creep):
     cost = Tracking([1.0 / micrometre**2, 0.0], [1.0])
     controller = loop_of(model, cost, 10, [0.0], bounds=Box([-1.0], [1.0]))
     assert controller.stability(np.zeros(2)).judged == (creep == 0.0)
+
+
+@pytest.mark.parametrize("penalized", ["increments", "inputs"])
+def test_a_locked_input_is_held_and_the_loop_is_judged(penalized):
+    cost = Tracking([1.0], [0.1], penalized=penalized)
+    two = Tracking([1.0], [0.1, 0.1], penalized=penalized)
+    alone = loop_of(linear([[1.3]], [[1.0]]), cost, 1, [0.0]).stability([0.0])
+    locked = Box([-1.0, 0.3], [1.0, 0.3])
+    beside = linear([[1.3]], [[1.0, 0.5]])
+    held = loop_of(beside, two, 1, [0.0, 0.3], bounds=locked).stability([0.0])
+    assert held.inputs[0] == pytest.approx([-0.15, 0.3], abs=1e-2)
+    radius = max(alone.spectral_radius, 1.0 if penalized == "increments" else 0.0)
+    assert held.spectral_radius == pytest.approx(radius)
+    assert held.stable == alone.stable
+
+
+def test_inputs_rest_within_their_bounds_where_others_can_hold():
+    pushed = Affine(
+        torch.ones(1, 1, dtype=torch.float64),
+        torch.ones(1, 2, dtype=torch.float64),
+        torch.tensor([-1.0], dtype=torch.float64),
+    )
+    weak = Box([-0.1, -2.0], [0.1, 2.0])
+    cost = Tracking([1.0], [0.1, 0.1])
+    loop = loop_of(KnownModel(pushed, 1, 2), cost, 5, [0.0, 0.0], bounds=weak)
+    stability = loop.stability([0.0])
+    assert stability.inputs[0] == pytest.approx([0.1, 0.9], abs=1e-2)
+    assert stability.stable
+
+
+def test_beyond_a_constraint_of_the_states_nothing_is_judged():
+    cost = Tracking([1.0], [0.1])
+    walled = Problem(cost, constraints=[Box(upper=[1.0])])
+    settings = PredictionSettings(covariance="none")
+    loop = GPMPC(INTEGRATOR, Linearization(), walled, 5, [0.0], settings)
+    assert loop.stability([0.5]).judged
+    assert not loop.stability([2.0]).judged
+
+
+def test_a_drift_is_no_rest_wherever_the_origin_is():
+    """Nothing holds the current, 2 a step."""
+
+    def drift(x, u):
+        return torch.stack([x[:, 0] + 2.0, 0.5 * x[:, 1] + u[:, 0]], dim=1)
+
+    cost = Tracking([1.0, 1.0], [0.1])
+    loop = loop_of(KnownModel(drift, 2, 1), cost, 5, [0.0])
+    assert not loop.stability([0.0, 0.0]).judged
+    assert not loop.stability([5.5e6, 0.0]).judged
+
+
+def test_points_at_which_a_model_has_no_numbers_are_left_out():
+    def implicit(x, u):  # its matrix is singular at 1
+        matrix = (x - 1.0)[..., None]
+        return torch.linalg.solve(matrix, (x - 1.0) * (0.5 * x + u))
+
+    loop = loop_of(KnownModel(implicit, 1, 1), Tracking([1.0], [0.1]), 5, [0.0])
+    assert not loop.stability([1.0]).judged
+    path = loop.stability(np.array([[0.0], [1.0], [1.0], [0.2], [0.2]]))
+    assert path.states[:, 0].max() < 1.0
+
+
+@pytest.mark.parametrize(
+    ("states", "error", "rule"),
+    [
+        ([np.nan, 0.0], DataError, "must be finite"),
+        ([0.0, 0.0, 0.0], ShapeError, r"must be \(2,\) or \(K, 2\); got \(3,\)"),
+    ],
+)
+def test_a_reference_of_something_else_is_refused(states, error, rule):
+    model = linear([[1.0, 0.1], [0.0, 1.0]], [[0.0], [0.1]])
+    loop = loop_of(model, Tracking([1.0, 0.1], [0.1]), 5, [0.0])
+    with pytest.raises(error, match=rule):
+        loop.stability(states)
+
+
+def test_noise_that_depends_on_the_state_is_noise():
+    class Rough(KnownModel):
+        @property
+        def noise_covariance(self):
+            raise UnsupportedModel("it depends on the state")
+
+    known = Rough(lambda x, u: 1.0005 * x, 1, 1)
+    problem = Problem(Tracking([0.0], [0.1]))
+    settings = PredictionSettings(covariance="none")
+    propagator = Linearization(process_noise=False)
+    loop = GPMPC(known, propagator, problem, 3, [0.0], settings)
+    assert loop.stability([0.0]).stable
