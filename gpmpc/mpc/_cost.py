@@ -433,6 +433,8 @@ def _count_once(function: Any) -> tuple[int, int]:
     """Counts the arguments of a function that has a hash, once; see its caller."""
     if hasattr(function, "n_in"):
         return function.n_in(), function.n_in()
+    if isinstance(function, torch.nn.Module):  # which by itself takes anything
+        function = function.forward
     try:
         parameters = inspect.signature(function).parameters.values()
     except ValueError:  # such as torch.sin

@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from gpmpc.exceptions import SettingError, SolverFailure
+from gpmpc.gaussian import Gaussian
 from gpmpc.models import KnownModel
 from gpmpc.mpc import (
     GPMPC,
@@ -14,6 +17,7 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
+from gpmpc.mpc._controller import model_of
 from gpmpc.mpc.baselines import LQR
 from gpmpc.propagation import Linearization
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
@@ -243,3 +247,46 @@ def test_parameters_that_are_not_finite_cost_one_step():
     assert applied == pytest.approx(planned)
     loop.input(np.zeros(2), GOAL, parameters=[3.0])
     assert loop.failures == 1
+
+
+class Filtered:
+    """Is told the first state, guesses the second, and shows the problem of both."""
+
+    def __init__(self, inner):
+        self.inner = inner
+        self.problem = inner.problem
+        self.horizon = inner.horizon
+        self.initial_input = inner.initial_input
+
+        self.last = None
+
+    def control(self, belief, reference, previous=None):
+        states = np.pad(reference.states, ((0, 0), (0, 1)))
+        guess = 0.0 if self.last is None else self.last.means[1, 1]
+        both = Gaussian.certain(np.array([float(belief.mean[0]), guess]))
+        self.last = self.inner.control(both, Reference(states), self.last)
+        means = self.last.means[:, :1]
+        return replace(self.last, means=means, covariances=np.zeros((11, 1, 1)))
+
+
+def test_a_controller_that_estimates_more_than_is_measured_is_judged():
+    loop = ControlLoop(Filtered(controller()))
+    x = np.zeros(2)
+    for _ in range(30):
+        x = next_state(x, loop.input(x[:1], GOAL[:1]))
+    assert loop.failures == 0
+    assert loop.judgement.level == "healthy"
+    for _ in range(30):  # nothing answers
+        loop.input(x[:1], 5.0 * GOAL[:1])
+    assert loop.judgement.level == "suspicious"
+
+
+def test_a_controller_around_others_has_the_model_of_the_innermost():
+    class Around:
+        def __init__(self, inner):
+            self.controller = inner
+
+    inner = controller()
+    assert model_of(Around(Around(inner))) is inner.prediction.model
+    inner.model = np.eye(2)  # which is neither true nor false
+    assert model_of(Around(inner)) is inner.model

@@ -11,7 +11,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, SparseTrainer, Transitions, train
 from gpmpc.models import Affine, DelayedModel, KnownModel, ResidualModel
 from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
-from gpmpc.mpc._novelty import data_scales
+from gpmpc.mpc._novelty import DataScales, data_scales, novelty_of
 from gpmpc.propagation import Linearization, MomentMatching
 
 PROBLEM = Problem(Tracking([1.0, 1.0], [0.1]), Box([-1.0], [1.0]))
@@ -189,3 +189,11 @@ def test_it_is_not_known_of_models_that_are_no_gps():
     decision = decide(controller(nominal), 0.2)
     assert math.isnan(decision.novelty)
     assert not decision.far_from_data
+
+
+@pytest.mark.parametrize("overflown", ["added", "covariances"])
+def test_what_overflowed_is_not_near_the_data(overflown):
+    arrays = {"added": np.zeros((2, 1, 1)), "covariances": np.zeros((3, 1, 1))}
+    arrays[overflown][1] = np.nan
+    scales = DataScales(variances=np.ones(1), ranges=np.ones(1))
+    assert novelty_of(noise=np.zeros(1), scales=scales, **arrays) == math.inf

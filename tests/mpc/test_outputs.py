@@ -265,6 +265,12 @@ def test_a_plan_is_flagged_only_where_it_leaves_the_data(rng):
         assert beyond.far_from_data
 
 
+def test_a_module_is_a_function_of_what_its_forward_takes():
+    layer = torch.nn.Linear(2, 1, dtype=torch.float64)
+    output = LeastSquares(layer, [1.0])
+    assert output.squares(np.ones((3, 2)), np.ones((3, 1)), None).shape == (3, 4, 4)
+
+
 def test_mistakes_are_one_clear_error():
     tracking = Tracking([1.0] * 3, [0.1] * 2)
     at = Gaussian.certain(STATE)
