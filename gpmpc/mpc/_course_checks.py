@@ -177,19 +177,18 @@ def planned_costs(memory, reading):
     states = memory.states
     H = len(means) - 1
     steps = 0.0
+    steps_before_end = 0.0
     promise = 0.0
     for k in range(H):
         target = references[min(k + 1, len(references) - 1)]
         for i in range(len(states)):
             off = usual(means[k + 1, i]) - target[i]
             states[i].component = wrapped(off, states[i].is_angle)
-        if k == H - 1:
-            plan = steps + _squared_length_at_end(memory)
-        if k < LONG or k < H - 1:
-            steps += _squared_length(memory)
+        steps_before_end = steps
+        steps += _squared_length(memory)
         if k < LONG:
             promise = steps
-    return plan, promise
+    return steps_before_end + _squared_length_at_end(memory), promise
 
 
 @njit_noalloc

@@ -170,6 +170,7 @@ class _RestSearch:
         start = np.concatenate([state, input])
         current = self._at(state, input)
         least_sizes = self._least_sizes(current)
+        sizes = least_sizes
         for _ in range(_ITERATIONS):
             if not math.isfinite(current.value):
                 return None
