@@ -50,11 +50,11 @@ class _OpenJob:
     """A job that is not settled yet."""
 
     job: Job
-    #: when an attempt failed that does not count [ns]; None: every failure counts
-    ignored_failure_at: int | None
+    #: when the attempt failed whose failure does not count [ns]; None: every one does
+    failure_to_ignore: int | None
     #: when the last attempt before the launch began [ns]; None: there was none, or an
     #: adopted chunk has the job, and when that began it is not known
-    begun_at_launch: int | None = None
+    begun_before_launch: int | None = None
 
     @property
     def path(self) -> str:
@@ -64,7 +64,7 @@ class _OpenJob:
     @property
     def begun_since_launch(self) -> bool:
         """Whether an attempt was begun since the chunks were started."""
-        return self.job.folder.begun_at != self.begun_at_launch
+        return self.job.folder.begun_at != self.begun_before_launch
 
 
 OnSettled = Callable[[Any, RunState], None]  # takes a job, which finished or failed
@@ -88,11 +88,11 @@ class Flying:
     on_settled: OnSettled
     retries: int
     #: runs that flew again in this call, since their process or node died; paths
-    repeated: set[str] = field(default_factory=set)
+    flown_again_now: set[str] = field(default_factory=set)
     #: runs that were ended from outside before, and fly once more; paths
-    tried_again: list[str] = field(default_factory=list)
+    flown_again_from_before: list[str] = field(default_factory=list)
     #: runs that were ended from outside too often, and do not fly; attempts by path
-    given_up: dict[str, int] = field(default_factory=dict)
+    out_of_retries: dict[str, int] = field(default_factory=dict)
     #: why runs failed whose folders cannot be written, such as on a full disk, by path
     reasons_not_kept: dict[str, str] = field(default_factory=dict)
     _has_launched: bool = False
@@ -112,21 +112,21 @@ class Flying:
         failed_at = job.folder.failed_at
         attempts = 0 if failed_at is None else job.folder.outside_attempts
         if attempts > self.retries:
-            self.given_up[path] = attempts
+            self.out_of_retries[path] = attempts
             self.on_settled(job, RunState.FAILED)
             return
         if attempts:
-            self.tried_again.append(path)
-        self._open[path] = _OpenJob(job, ignored_failure_at=failed_at)
+            self.flown_again_from_before.append(path)
+        self._open[path] = _OpenJob(job, failure_to_ignore=failed_at)
 
     def _fly_once(self) -> bool:
         """Flies the jobs that nobody works on, and settles those that have ended.
 
         Returns:
-            Whether any were flown. Others are in the hands of another sweep.
+            Whether any were flown; else all of them are in the hands of other sweeps.
         """
-        with self.launcher.turn():
-            running = self.launcher.running({*self._open})
+        with self.launcher.exclusive_launch():
+            running = self.launcher.adopt({*self._open})
             ends = self._launch(running)
         if ends is None:
             return False
@@ -139,7 +139,8 @@ class Flying:
                     self._settle_dead_chunk(end)
                     continue
                 unsettled = self._unsettled(end.chunk)
-                # A chunk may stop after any of its runs, and leave the others.
+                # A chunk flies at least one run, and may stop after any, and leave the
+                # others: only where none has ended, something is wrong.
                 if len(unsettled) == len(end.chunk.folders):
                     unseen += [(open_job, end) for open_job in unsettled]
         self._judge_unseen(unseen)
@@ -155,7 +156,7 @@ class Flying:
         for open_job in self._open_jobs(chunk):
             failed_at = open_job.job.folder.failed_at
             if failed_at is not None and failed_at > launched:
-                open_job.ignored_failure_at = None
+                open_job.failure_to_ignore = None
 
     def _launch(
         self, running: Sequence[Chunk]
@@ -164,11 +165,11 @@ class Flying:
         in_hand = {path for chunk in running for path in _paths(chunk)}
         to_fly = []
         for path, open_job in [*self._open.items()]:
-            open_job.begun_at_launch = None
+            open_job.begun_before_launch = None
             if path in in_hand:
                 continue
             folder = open_job.job.folder
-            open_job.begun_at_launch = folder.begun_at
+            open_job.begun_before_launch = folder.begun_at
             state = folder.state
             if not self._settle(open_job) and state is not RunState.RUNNING:
                 to_fly.append(open_job.job)
@@ -193,7 +194,7 @@ class Flying:
     def _settle(self, open_job: _OpenJob) -> bool:
         """Takes a job off the list where it has finished, or failed in this call."""
         job = open_job.job
-        state = job.folder.outcome_since(open_job.ignored_failure_at)
+        state = job.folder.outcome_since(open_job.failure_to_ignore)
         if state is None:
             return False
         del self._open[open_job.path]
@@ -239,8 +240,8 @@ class Flying:
             self._settle_without_file(open_job, reason)
             return
         if cause in _REPEATED and job.folder.outside_attempts <= self.retries:
-            self.repeated.add(open_job.path)
-            open_job.ignored_failure_at = job.folder.failed_at
+            self.flown_again_now.add(open_job.path)
+            open_job.failure_to_ignore = job.folder.failed_at
             return
         self._settle(open_job)
 

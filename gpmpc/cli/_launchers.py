@@ -63,7 +63,7 @@ class Cause(Enum):
     NODE = "node"
     #: the process died, and nobody knows why
     CRASH = "crash"
-    #: it could not begin, or an exception came out of it
+    #: it could not begin, an exception came out of it, or what it flew is not seen
     ERROR = "error"
 
 
@@ -104,7 +104,7 @@ class Launcher(Protocol):
         """Processes at the same time; None where that is the cluster's business."""
         ...
 
-    def turn(self) -> AbstractContextManager[object]:
+    def exclusive_launch(self) -> AbstractContextManager[object]:
         """Keeps other sweeps of this tree from launching inside."""
         ...
 
@@ -117,7 +117,7 @@ class Launcher(Protocol):
         """
         ...
 
-    def running(self, paths: Set[str]) -> Sequence[Chunk]:
+    def adopt(self, paths: Set[str]) -> Sequence[Chunk]:
         """Adopts chunks of another call whose end nobody has seen yet.
 
         They are those with any of the folders ``paths``; ``launch`` tells their ends.
@@ -129,7 +129,7 @@ class Launcher(Protocol):
     ) -> Generator[ChunkEnd, None, None]:
         """Starts ``chunks``, and yields how they and the adopted ones end.
 
-        Adopted are those that the last call of ``running`` returned.
+        Adopted are those that the last call of ``adopt`` returned.
 
         Some may be left for a later call, where there is no room for all.
 
@@ -172,13 +172,13 @@ class Basic:
     def __init__(self, tree: Path):
         self.tree = tree
 
-    def turn(self) -> AbstractContextManager[object]:
+    def exclusive_launch(self) -> AbstractContextManager[object]:
         return nullcontext()
 
     def call(self, function: Work, argument: Any) -> None:
         function(argument)
 
-    def running(self, paths: Set[str]) -> Sequence[Chunk]:
+    def adopt(self, paths: Set[str]) -> Sequence[Chunk]:
         return ()
 
     def launch(
@@ -217,7 +217,7 @@ class Joblib:
         self.workers = effective_n_jobs(n_jobs)
         self._idle: list[ProcessPoolExecutor] = []
 
-    def turn(self) -> AbstractContextManager[object]:
+    def exclusive_launch(self) -> AbstractContextManager[object]:
         return nullcontext()
 
     def call(self, function: Work, argument: Any) -> None:
@@ -249,7 +249,7 @@ class Joblib:
         with children_ignore_interrupts():
             return executor.submit(work, argument), executor
 
-    def running(self, paths: Set[str]) -> Sequence[Chunk]:
+    def adopt(self, paths: Set[str]) -> Sequence[Chunk]:
         return ()
 
     def launch(

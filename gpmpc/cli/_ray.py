@@ -54,13 +54,13 @@ class Ray:
         # A run that died is flown again by the sweep, which counts how often.
         self._remote = dict(ray["remote"]) | {"max_retries": 0}
 
-    def turn(self) -> AbstractContextManager[object]:
+    def exclusive_launch(self) -> AbstractContextManager[object]:
         return nullcontext()
 
     def call(self, function: Work, argument: Any) -> None:
         function(argument)
 
-    def running(self, paths: Set[str]) -> Sequence[Chunk]:
+    def adopt(self, paths: Set[str]) -> Sequence[Chunk]:
         """Returns none: Ray ends the tasks of a sweep that is killed."""
         return ()
 

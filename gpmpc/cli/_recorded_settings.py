@@ -108,7 +108,10 @@ def checked_settings(settings: Any, trusted: Sequence[str]) -> Any:
         _check_form(call)
         _check_name(call, trusted)
         _check_arguments(call, call.code, trusted)
-    for call in calls:  # every name is allowed: trusted packages may be imported now
+    # Every name is allowed: trusted packages may be imported now, which tells what
+    # names of theirs stand for. ``my_robot.Solver`` may be a listed function's alias,
+    # whose arguments have to be checked as well.
+    for call in calls:
         if call.code not in SETTINGS_CODE:
             alias = shipped_name(trusted_code(call.code, trusted))
             _check_arguments(call, alias, trusted)

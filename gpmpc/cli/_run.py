@@ -281,7 +281,10 @@ class _Recordings:
         self._system = RecordedSystem.of(experiment.system)
         episodes = getattr(experiment.learning, "episodes", 0)
         names = [f"episode_{k}.mcap" for k in range(1, 1 + episodes)]
-        self._paths = iter([to_fly.folder.path / name for name in (*names, RECORDING)])
+        # One for each call of ``open_next``, in the order in which they are flown.
+        self._paths_of_flights = iter(
+            [to_fly.folder.path / name for name in (*names, RECORDING)]
+        )
 
     @contextmanager
     def open_next(
@@ -296,7 +299,7 @@ class _Recordings:
         bounds = controller.problem.inputs.by_stage(controller.horizon)
         gp_size = self._gp_size(training)
         with McapRecorder(
-            next(self._paths),
+            next(self._paths_of_flights),
             replace(self._system, input_bounds=[side[0] for side in bounds]),
             metadata=self._metadata(training, controller),
             config=self._yaml_text,

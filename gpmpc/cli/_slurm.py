@@ -176,7 +176,7 @@ class Slurm:
             **(additional_parameters or {}),
         }
 
-    def turn(self) -> AbstractContextManager[object]:
+    def exclusive_launch(self) -> AbstractContextManager[object]:
         """Keeps other sweeps of this tree from submitting inside."""
         self._logs.mkdir(parents=True, exist_ok=True)
         return FileLock(self._logs / "lock")
@@ -184,7 +184,7 @@ class Slurm:
     def call(self, function: Work, argument: Any) -> None:
         function(argument)
 
-    def running(self, paths: Set[str]) -> Sequence[Chunk]:
+    def adopt(self, paths: Set[str]) -> Sequence[Chunk]:
         """Adopts chunks of arrays whose end nobody has seen yet."""
         self._adopted = []
         for array in self._unended():
@@ -240,7 +240,8 @@ class Slurm:
         queue = _queue() if folders else None
         for folder in folders:
             # Where Slurm does not know it, its sweep was killed before it submitted it.
-            in_queue = queue is None or any(name == folder.name for name, _ in queue)
+            is_silent = queue is None
+            in_queue = is_silent or any(name == folder.name for name, _ in queue)
             if in_queue or (folder / _SUBMITTED).exists():
                 array = self._read_array(folder)
                 if array is not None:
@@ -367,6 +368,7 @@ class Slurm:
             array.waiting -= ended.keys()
             for index, job in ended.items():
                 yield self._chunk_end(array, index, job)
+            # ``waiting`` are those that this sweep wants; others may run as well.
             states = [jobs.get((array.name, i)) for i in range(len(array.chunks))]
             some_wait = any(job and job.state not in _ENDED_STATES for job in states)
             if not array.waiting and not some_wait:

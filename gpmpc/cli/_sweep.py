@@ -92,7 +92,7 @@ class Sweep:
         #: folders of runs that were flown again, since their process was ended
         self.flown_again: set[str] = set()
         #: attempts of runs that were ended too often, by folder; they do not fly again
-        self.given_up: dict[str, int] = {}
+        self.out_of_retries: dict[str, int] = {}
         #: folders of finished runs that are none of this sweep: another process wrote
         #: a damaged result, or flew other settings
         self.unusable: set[Path] = set()
@@ -116,7 +116,8 @@ class Sweep:
     def check(self, jobs: Sequence[Job]) -> None:
         """Finds mistakes in the settings before anything is launched.
 
-        Finished runs must have these settings; their warnings and other code are noted.
+        Finished runs must have these settings; their warnings, other code and times
+        are noted, for what is said at the end and for how many runs a process flies.
         """
         finished = []
         waiting = []
@@ -175,7 +176,7 @@ class Sweep:
         self._track_finished(jobs)
         outcomes: list[JobOutcome] = []
 
-        def settle(job: Job, state: RunState) -> None:
+        def settle(job: Job, state: RunState) -> None:  # called by ``flying`` below
             self._chunking.measure(job)
             reason = flying.reasons_not_kept.get(str(job.folder.path))
             outcomes.append(self._outcome(job, state, reason))
@@ -188,8 +189,8 @@ class Sweep:
             retries=self.config.retries,
         )
         flying.fly(job.with_absolute_path() for job in jobs if not job.folder.finished)
-        self.flown_again |= {*flying.tried_again, *flying.repeated}
-        self.given_up |= flying.given_up
+        self.flown_again |= {*flying.flown_again_from_before, *flying.flown_again_now}
+        self.out_of_retries |= flying.out_of_retries
         return outcomes
 
     def _track_finished(self, jobs: Sequence[Job]) -> None:
@@ -294,11 +295,11 @@ class Sweep:
                 f"at most {retries} times each (retries)",
                 highlight=False,
             )
-        if self.given_up:
+        if self.out_of_retries:
             print_error(
-                f"{len(self.given_up)} of the runs were ended by a cluster or a crash "
-                f"more than {retries} times, and are not flown again; "
-                f"retries={max(self.given_up.values())} flies them once more"
+                f"{len(self.out_of_retries)} of the runs were ended by a cluster or a "
+                f"crash more than {retries} times, and are not flown again; "
+                f"retries={max(self.out_of_retries.values())} flies them once more"
             )
 
     def print_warnings(self) -> None:

@@ -367,6 +367,7 @@ def _until_steps_end(run: "Run", values: np.ndarray) -> tuple[np.ndarray, np.nda
     """
     gaps = gaps_of(run)
     ends = _step_ends(run)
+    # The times that are added stand where ``broken`` puts its NaN.
     times = np.insert(run.times, gaps, ends[gaps - 1])
     held_values = broken(values, gaps)
     return np.append(times, ends[-1]), np.append(held_values, values[-1])

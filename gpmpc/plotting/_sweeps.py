@@ -100,7 +100,8 @@ def draw_quartiles(
 def _places_side_by_side(lines: Sequence[Series]) -> np.ndarray:
     """Returns how far each line stands from the middle of each position, in distances.
 
-    Only lines with values at a position share it: one alone stands on its tick.
+    Only lines with values at a position share it: one alone stands on its tick, two
+    stand at -1/2 and 1/2, three at -1, 0 and 1.
     """
     has_values = np.array([[bool(group) for group in line.values] for line in lines])
     rank = has_values.cumsum(axis=0) - 1

@@ -19,9 +19,10 @@ To record one more number of a step, add
 6. the line that reads it to ``_make_run`` in ``_read_run``.
 
 To record one more topic, add a message to ``_schema.PROTO`` and its topic to
-``TOPICS``, yield it in ``Encoder.encode``, and read it in
-``_decoding.decode_messages``. Files without the field or topic are still read: protobuf
-gives zeros, and no messages.
+``TOPICS``, take its class in ``Encoder.__init__`` and yield it in ``Encoder.encode``,
+read it in ``_decoding.decode_messages`` to a field of ``DecodedMessages``, and hand
+that to ``Run`` in ``_read_run._make_run``. Files without the field or topic are still
+read: protobuf gives zeros, and no messages.
 """
 
 from gpmpc.recording._bags import bag_flaws

@@ -20,9 +20,8 @@ from gpmpc.recording._records import whole_records
 from gpmpc.recording._schema import (
     CHANNELS_METADATA,
     CONFIG_ATTACHMENT,
-    PLAN,
-    QP,
     STEP,
+    TOPICS,
     check_names,
     names_in,
 )
@@ -33,7 +32,7 @@ class FileContent:
     """The records of a file; messages of the topics that a run is read from."""
 
     messages: dict[str, list[Message]] = field(
-        default_factory=lambda: {STEP: [], PLAN: [], QP: []}
+        default_factory=lambda: {topic: [] for topic in TOPICS}
     )
     counts: Counter[int] = field(default_factory=Counter)  # of messages, by channel
     channels: dict[int, Channel] = field(default_factory=dict)

@@ -54,21 +54,21 @@ class StepCopy:
 
     def __init__(self, step: Step, n: int, m: int, record_problem: bool):
         arrays = _arrays_of_step(step)
-        shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_STATE_ARRAYS, (n,))
-        shapes["input"] = (m,)
-        shapes["belief_covariance"] = (n, n)
+        expected_shapes: dict[str, tuple[int, ...]] = dict.fromkeys(_STATE_ARRAYS, (n,))
+        expected_shapes["input"] = (m,)
+        expected_shapes["belief_covariance"] = (n, n)
         decision = step.decision
         if decision is not None:
             H = len(decision.inputs)
             arrays |= _arrays_of_decision(decision, record_problem)
-            shapes["inputs"] = (H, m)
-            shapes["means"] = (H + 1, n)
-            shapes["covariances"] = (H + 1, n, n)
+            expected_shapes["inputs"] = (H, m)
+            expected_shapes["means"] = (H + 1, n)
+            expected_shapes["covariances"] = (H + 1, n, n)
         contiguous: dict[str, Any] = {
             name: np.ascontiguousarray(array, dtype=float)
             for name, array in arrays.items()
         }
-        for name, shape in shapes.items():
+        for name, shape in expected_shapes.items():
             if contiguous[name].shape != shape:
                 raise ShapeError(
                     f"step {step.k}: {name} must be {shape}; "

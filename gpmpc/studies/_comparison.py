@@ -192,7 +192,8 @@ class _CompletePart(NamedTuple):
 def _complete_part(in_both: pd.DataFrame) -> _CompletePart:
     """Leaves out settings and seeds until every run of the others is in both groups.
 
-    What lacks the largest share of its runs goes first.
+    What lacks the largest share of its runs goes first; of a seed and a setting that
+    lack as much the seed does: a setting that is left out changes what is compared.
 
     Args:
         in_both: Whether a run is, a row a combination of settings, a column a seed.

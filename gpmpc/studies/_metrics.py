@@ -223,8 +223,10 @@ def _violation_rates(
     boxes are one, "states"; of another kind each constraint is counted for itself.
     """
     lower, upper = problem.inputs.by_stage(horizon)
+    first_stage_lower = lower[0]
+    first_stage_upper = upper[0]
     commands = rollout.inputs if rollout.commands is None else rollout.commands
-    rates = {"inputs": violation_rate(commands, lower[0], upper[0])}
+    rates = {"inputs": violation_rate(commands, first_stage_lower, first_stage_upper)}
     states = rollout.states[1:]
     constraints = [
         constraint

@@ -5,7 +5,8 @@
     metrics.json   the results; written last and in one piece: where it is, the run is
                    finished
     error.json     why it failed, where it did
-    .error.json    why the attempt before this one failed
+    .error.json    why the attempt before this one failed, and how many attempts were
+                   ended from outside
     .lock          locked while a process works on it; says which one
 
 Any number of processes can work on one tree of such folders: who works on a folder
@@ -122,18 +123,18 @@ class RunFolder:
         except FileNotFoundError:
             return None
 
-    def outcome_since(self, failed_before: int | None) -> RunState | None:
+    def outcome_since(self, last_known_failure: int | None) -> RunState | None:
         """Returns FINISHED or FAILED; None where the run has not ended.
 
         A failure of the same moment is the same failure.
 
         Args:
-            failed_before: When an attempt failed that does not count [ns]; None where
-                every one does.
+            last_known_failure: When an attempt failed that does not count [ns]; None
+                where every one does.
         """
         if self.finished:
             return RunState.FINISHED
-        if self.failed_at not in (None, failed_before):
+        if self.failed_at not in (None, last_known_failure):
             return RunState.FAILED
         return None
 

@@ -123,7 +123,7 @@ def test_a_limit_fails_the_run_that_reached_it_alone(cause, tmp_path):
         cause.value,
         "n1",
     )
-    assert not flying.repeated
+    assert not flying.flown_again_now
     assert len(launcher.launched) == 2
 
 
@@ -159,7 +159,7 @@ def test_a_run_whose_process_dies_flies_again_as_often_as_allowed(cause, tmp_pat
 
     flying, states = flown(Told(tmp_path, dies(), dies()), jobs, size=2)
     assert set(states.values()) == {"finished"}
-    assert flying.repeated == {str(jobs[0].folder.path)}
+    assert flying.flown_again_now == {str(jobs[0].folder.path)}
 
     jobs = jobs_of(tmp_path / "other", "flies", "flies")
     launcher = Told(tmp_path, dies(), dies())
@@ -169,11 +169,11 @@ def test_a_run_whose_process_dies_flies_again_as_often_as_allowed(cause, tmp_pat
 
     flying, states = flown(launcher, [jobs[0]], retries=1)
     assert states == {"0-flies": "failed"}
-    assert flying.given_up == {str(jobs[0].folder.path): 2}
+    assert flying.out_of_retries == {str(jobs[0].folder.path): 2}
 
     flying, states = flown(launcher, [jobs[0]], retries=2)
     assert states == {"0-flies": "finished"}
-    assert flying.tried_again == [str(jobs[0].folder.path)]
+    assert flying.flown_again_from_before == [str(jobs[0].folder.path)]
 
 
 def test_a_chunk_whose_process_began_nothing_counts_for_all_of_it(tmp_path):
@@ -241,7 +241,7 @@ def test_a_process_of_joblib_that_dies_takes_one_chunk_with_it(tmp_path):
     assert error["attempts"] == 2
     assert "died (SIGKILL(-9))" in error["error"]
     assert error_of(jobs[5])["error"] == "ValueError: of nobody's making"
-    assert flying.repeated == {str(jobs[i].folder.path) for i in (0, 2)}
+    assert flying.flown_again_now == {str(jobs[i].folder.path) for i in (0, 2)}
 
 
 @pytest.mark.parametrize("wrong", [0, 1.5, "many"])

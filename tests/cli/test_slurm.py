@@ -265,8 +265,8 @@ def test_the_jobs_of_a_killed_sweep_are_watched_and_not_flown_twice(fake, tree):
     (fake / "queue").write_text("0|RUNNING|None|n1\n1|PENDING|Resources|\n")
     again = Slurm(tree)
     paths = {str(job.folder.path) for job in jobs}
-    assert len(again.running(paths)) == 2
-    assert again.running({str(jobs[2].folder.path)}) == []
+    assert len(again.adopt(paths)) == 2
+    assert again.adopt({str(jobs[2].folder.path)}) == []
 
     fly(in_chunks(1)(jobs)[0])
     (fake / "queue").write_text("0|COMPLETED|None|n1\n1|TIMEOUT|TimeLimit|n2\n")
@@ -276,7 +276,7 @@ def test_the_jobs_of_a_killed_sweep_are_watched_and_not_flown_twice(fake, tree):
     # the limit is that of the call that submitted it
     assert "wall time of 5 min" in jobs[1].folder.error()
     assert len((fake / "submitted").read_text().splitlines()) == 2
-    assert Slurm(tree).running(paths) == []
+    assert Slurm(tree).adopt(paths) == []
 
 
 def test_a_failure_before_a_job_was_submitted_is_none_of_its(fake, tree):
@@ -323,7 +323,7 @@ def test_chunks_of_another_gpmpc_are_told_and_left(fake, tree, capsys):
     assert has_jobs(tree)
     (chunks,) = tree.glob(".slurm/*/chunks")
     chunks.write_bytes(b"cgpmpc.cli._slurm\nGone\n.")
-    assert Slurm(tree).running({str(job.folder.path)}) == []
+    assert Slurm(tree).adopt({str(job.folder.path)}) == []
     assert f"scancel -n {chunks.parent.name}" in capsys.readouterr().err
 
 
@@ -352,7 +352,7 @@ def test_what_was_never_submitted_is_no_job(fake, tree):
     Slurm(tree).launch(fly, in_chunks(1)(jobs))
     (marked,) = tree.glob(".slurm/*/submitted")
     marked.unlink()
-    assert Slurm(tree).running({str(jobs[0].folder.path)}) == []
+    assert Slurm(tree).adopt({str(jobs[0].folder.path)}) == []
 
 
 def test_a_slurm_that_does_not_answer_for_a_while_is_waited_for(fake, tree):

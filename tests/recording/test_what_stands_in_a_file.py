@@ -15,11 +15,13 @@ from gpmpc.recording import (
     _decoding,
     _recorder,
     _records,
+    _schema,
     _sink,
     layout,
     read_run,
     recover,
 )
+from gpmpc.recording._content import read_content
 from gpmpc.status import Status
 from gpmpc.systems import rotational, translational
 from tests.recording import runs
@@ -52,6 +54,11 @@ def path(tmp_path_factory):
         recorder.record(runs.make_step(0, rng))
         recorder.record(runs.make_step(7, rng, status=Status.INFEASIBLE, failed=True))
     return path
+
+
+def test_a_topic_more_is_read_from_every_file(path, monkeypatch):
+    monkeypatch.setitem(_schema.TOPICS, "/new", "Step")
+    assert read_content(path).messages["/new"] == []
 
 
 def test_every_message_has_the_time_of_its_step(path):
