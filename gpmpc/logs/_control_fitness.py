@@ -165,10 +165,14 @@ def _disagreements(effects: Sequence[Effect]) -> list[str]:
 
 
 def _agree(model: float, low: float, high: float) -> bool:
-    """Returns whether a derivative is about inside an interval, or has its sign."""
+    """Returns whether a derivative is about inside an interval, and has its sign.
+
+    The interval is of an effect that differs from none.
+    """
     half = (high - low) / 2
     centre = (high + low) / 2
-    return abs(model - centre) <= 2 * half + 0.5 * abs(centre)
+    has_sign = model * centre > 0
+    return has_sign and abs(model - centre) <= 2 * half + 0.5 * abs(centre)
 
 
 def _gains(
@@ -327,8 +331,12 @@ def _unstable_loops(
             if K is None:
                 continue
             tried += 1
-            loop = np.linalg.eigvals(rival_A[k] - rival_B[k] @ K)
-            unstable += bool(np.abs(loop).max() > _UNSTABLE)
+            loop = rival_A[k] - rival_B[k] @ K
+            if not np.isfinite(loop).all():
+                unstable += 1
+                continue
+            poles = np.linalg.eigvals(loop)
+            unstable += bool(np.abs(poles).max() > _UNSTABLE)
         if unstable > tried / 2:
             sentences.append(
                 f"a feedback designed on the model makes the candidate {name!r} "

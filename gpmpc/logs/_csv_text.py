@@ -29,7 +29,8 @@ _WIDE_SPACE = re.compile(r"\t| {2,}")
 _BRACKETS = re.compile(r"\[.*\]|\(.*\)")
 _ABSENT = frozenset(("", "NA", "N/A", "n/a", "null", "NULL", "None", "<NA>"))
 _SAMPLE = 50  # lines by which the text is recognised
-_LONGEST_HEAD = 1000  # lines in which rows are looked for
+_LONGEST_HEAD = 1000  # lines in which rows are looked for,
+_LARGEST_HEAD = 2**18  # and characters
 _COMMENTS = 50  # before the first line that may hold the names of the columns
 _HEADER = 2  # lines before the rows that may hold the names, and the units
 _START = 1000  # bytes that the encoding is looked for in
@@ -133,6 +134,8 @@ def _read_head(lines: Iterator[str]) -> list[str]:
     """Reads lines until the last ones are rows, as far as a program's settings go."""
     head = list(islice(lines, 1 + _SAMPLE))
     while len(head) < _LONGEST_HEAD and not _are_rows(head[-_SAMPLE:]):
+        if sum(map(len, head)) > _LARGEST_HEAD:
+            break
         following = list(islice(lines, _SAMPLE))
         if not following:
             break
@@ -427,10 +430,19 @@ def _split_names(
         names = _split_line(line, separator)
         if _count_filled(names) <= widest and len(names) >= filled:
             return [] if _are_sentences(names, separator) else names
+        is_quoted = separator != WHITE_SPACE or '"' in line
+        if len(names) == filled - 1 and is_quoted and _are_numbered(rows):
+            return ["", *names]  # as R names its columns, and not those of the rows
     if WHITE_SPACE in separators:  # names of several words
         names = [name.strip() for name in _WIDE_SPACE.split(line.strip())]
         return names if len(names) == widest else []
     return []
+
+
+def _are_numbered(rows: Sequence[Fields]) -> bool:
+    """Tells whether rows begin with 1, 2, ..."""
+    numbers = [str(number) for number in range(1, len(rows) + 1)]
+    return len(rows) > 1 and [fields[0] for fields in rows] == numbers
 
 
 def _are_sentences(names: Fields, separator: str) -> bool:

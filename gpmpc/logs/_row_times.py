@@ -21,6 +21,8 @@ from gpmpc.logs._units import (
 
 # columns that hold the time where nobody says which
 TIMES = (STAMP, *NAMES_OF_TIMES)
+_CLOCK = r"\s*\d+:\d\d:\d\d(?:\.\d+)?\s*"
+_WITH_UNIT = r"^\s*(-?\d+(?:\.\d+)?)\s*([^\W\d_]+)\s*$"
 _SAMPLE = 50  # rows in which texts are looked at: are they dates?
 _SAME_SPAN = 0.02  # of the time that a log took: a clock in its messages goes as far
 LATEST_UNSTATED = 1e11  # [s] since 1970, in the year 5138
@@ -110,8 +112,9 @@ def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array
         times = read_column(where, table, column)
     except DataError as error:
         hint = (
-            "dates are read where they are written as 2024-05-01 12:00:00.0; else say "
-            "time: {step: SECONDS} where rows are equally far apart"
+            "dates are read where they are written as 2024-05-01 12:00:00.0, and "
+            "durations as 00:01:02.5 or 62.5 s; else say time: {step: SECONDS} where "
+            "rows are equally far apart"
         )
         raise DataError(f"{error}; {hint}") from error
     if holds_times(table, column):
@@ -147,7 +150,8 @@ def doubt_of_unit(table: pd.DataFrame, column: str, unit: str, times: Array) -> 
 
     They may where nobody stated one and they are whole numbers, as a counter of ms is.
     """
-    is_stated = unit or unit_text(table, column) or holds_times(table, column)
+    is_number = pd.api.types.is_numeric_dtype(table[column])
+    is_stated = unit or unit_text(table, column) or not is_number
     times = times[np.isfinite(times)]
     steps = np.abs(np.diff(times))
     if is_stated or not len(steps) or times.max() > EARLIEST_DATE:
@@ -187,19 +191,41 @@ def unit_of_clock(table: pd.DataFrame, column: str) -> str:
 
 
 def read_dates(table: pd.DataFrame, column: str) -> Array | None:
-    """Reads dates (K,) [s] since 1970 that are texts, such as 2024-05-01 12:00:00.
+    """Reads dates or durations (K,) [s] that are texts; None of anything else.
 
-    They are in ISO's format alone: in others, the day and the month may be confused.
-    Returns None where the column holds anything else.
+    Dates, such as 2024-05-01 12:00:00, are in ISO's format alone: in others, the day
+    and the month may be confused. They come out since 1970. Durations are as a clock
+    shows them, 00:01:02.5, or have their unit, 62.5 sec.
     """
     texts = table[column]
     if texts.dtype.kind in "biufmM" or pd.to_numeric(texts, errors="coerce").any():
         return None
+    durations = _read_durations(texts)
+    if durations is not None:
+        return durations
     dates = pd.to_datetime(texts, format="ISO8601", utc=True, errors="coerce")
     is_wrong = dates.isna() & ~texts.isna()
     if is_wrong.any() or dates.isna().all():
         return None
     return seconds(dates)
+
+
+def _read_durations(texts: pd.Series) -> Array | None:
+    """Reads durations (K,) [s] that are texts; None of anything else."""
+    present = texts.dropna()
+    if not len(present) or not all(isinstance(text, str) for text in present):
+        return None
+    if present.str.fullmatch(_CLOCK).all():
+        return seconds(pd.to_timedelta(texts))
+    parts = texts.str.extract(_WITH_UNIT)
+    if parts[0].notna().sum() < len(present):
+        return None
+    factors = {
+        word: TIME_UNITS.get(unit_of_time(word), np.nan)
+        for word in parts[1].dropna().unique()
+    }
+    durations = parts[0].astype(float) * parts[1].map(factors)
+    return None if durations.isna().sum() > texts.isna().sum() else durations.to_numpy()
 
 
 def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | None:

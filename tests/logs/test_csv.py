@@ -234,6 +234,15 @@ def test_any_number_of_settings_may_stand_before_the_rows(tmp_path, settings, da
     assert (finding.kind, finding.count) == ("lines before the rows", settings)
 
 
+@pytest.mark.parametrize("delimiter", [" ", ",", "\t"])
+def test_rows_that_r_numbers_have_their_columns(tmp_path, delimiter):
+    text = TABLE.set_axis(TABLE.index + 1).to_csv(sep=delimiter, quoting=2)
+    (tmp_path / "log.csv").write_text(text.removeprefix(f'""{delimiter}'))
+    file = read_file(tmp_path / "log.csv")
+    np.testing.assert_array_equal(file.tables[""][["t", "x", "u"]], TABLE)
+    assert not file.findings
+
+
 def test_counted_columns_are_no_row(tmp_path):
     (tmp_path / "log.csv").write_text("0,1,2\n" + TEXT.partition("\n")[2])
     mapping = {"time": 1, "states": {"x": [2]}, "inputs": {"u": [3]}}

@@ -721,10 +721,10 @@ def test_a_model_that_no_controller_should_use_is_named():
     def rates(x, u):
         return [x[1], -x[0] - 0.5 * x[1] + 2 * u[0]]
 
-    def fitness(inputs, states, history=(0, 0)):
+    def fitness(inputs, states, history=(0, 0), theta=THETA):
         log = log_of([states], [inputs])
         kinematics = Increments(log.space)
-        model = LogModel(kinematics, AffineNominal(kinematics), THETA, history)
+        model = LogModel(kinematics, AffineNominal(kinematics), theta, history)
         return judge_for_control(model, log, {})
 
     inputs = held_inputs(rng, 600, 1.0)
@@ -737,6 +737,11 @@ def test_a_model_that_no_controller_should_use_is_named():
     assert "mean error of d_T over the last 20 rows" in warning
     assert "disturbance_gain=0.1" in warning
     assert (good.effects[0].output, round(good.effects[0].gain, 3)) == ("d_T", 2.0)
+    noisy = states + 0.6 * rng.normal(size=states.shape)
+    other_sign = np.where(THETA == 2, -0.1, THETA)
+    assert not fitness(inputs, noisy).warnings
+    (warning,) = fitness(inputs, noisy, theta=other_sign).warnings
+    assert warning.startswith("the model says -0.1 for the effect of u on d_T, the")
     constant = fitness(np.full((600, 1), 0.3), simulate(rates, [1, 0], [[0.3]] * 600))
     assert "does not move" in constant.faults[0]
     assert "noise.input=[0.03]" in constant.advice[0]

@@ -415,6 +415,17 @@ def test_what_is_no_unit_of_times_is_asked_for(tmp_path, header):
     assert read_log(tmp_path / "a.csv", stated).time_step == pytest.approx(0.02)
 
 
+@pytest.mark.parametrize(
+    "text", ["00:01:{:05.2f}", "{:.2f} sec", "{:.4f} s", "2024-05-01 12:00:{:05.2f}"]
+)
+def test_times_in_texts_are_read(tmp_path, text):
+    rows = [f"{text.format(0.5 * k)},{k % 7},{k % 3}\n" for k in range(60)]
+    (tmp_path / "a.csv").write_text("t,x,u\n" + "".join(rows))
+    log = read_log(tmp_path / "a.csv", {"time": "t", **SIGNALS})
+    assert (log.time_step, kinds(log)) == (0.5, {})
+    assert inspect_log(tmp_path / "a.csv").streams["rate [Hz]"][0] == 2
+
+
 def test_another_unit_of_the_time_than_the_mapping_states_is_noted(tmp_path):
     rows = [f"{20 * k},{k % 7},{k % 3}\n" for k in range(60)]
     (tmp_path / "a.csv").write_text("t [ms],x,u\n" + "".join(rows))
