@@ -128,6 +128,7 @@ class _RolloutErrors:
     steps: np.ndarray  # whose errors count
     scale: Array  # of the errors (steps, e)
     unit: Array  # of the changes (o, r): each moves the outputs by as much
+    mean: Array  # of the regressors, about which they change (r,); the constant has 0
 
     @classmethod
     def of(cls, model: LogModel, log: Log, steps: int) -> "_RolloutErrors":
@@ -143,10 +144,13 @@ class _RolloutErrors:
         )
         counted = np.geomspace(1, steps, _COUNTED_STEPS).round().astype(int)
         counted = np.unique(counted)
-        deviation = _moments(model, log).deviation
+        moments = _moments(model, log)
+        deviation = moments.deviation
         # A regressor that never changes has an infinite deviation: its unit is zero, so
         # that its weight is not moved.
         effects = np.where(np.isfinite(deviation), model.weights * deviation, 0.0)
+        # About the means the constant is that of the outputs, wherever a unit begins.
+        effects[:, -1] += model.weights @ moments.mean
         size = np.linalg.norm(effects, axis=1, keepdims=True)
         return cls(
             model=model,
@@ -154,13 +158,15 @@ class _RolloutErrors:
             steps=counted,
             scale=errors_at_rest(windows, counted),
             unit=size / deviation,
+            mean=moments.mean,
         )
 
     def model_at(self, change: Array) -> LogModel:
         """Returns the model with changed weights (o r,), or many of them (T, o r)."""
         shape = (*change.shape[:-1], *self.unit.shape)
-        weights = self.model.weights + change.reshape(shape) * self.unit
-        return replace(self.model, weights=weights)
+        changes = change.reshape(shape) * self.unit
+        changes[..., -1] -= changes @ self.mean
+        return replace(self.model, weights=self.model.weights + changes)
 
     def __call__(self, change: Array) -> Array:
         """Computes the residuals of a change (o r,), as a vector."""

@@ -69,7 +69,8 @@ def error_variances(
     # Neighbours respond alike.
     responses = _responses(model, windows[::stride], steps, noise.time_constants)
     explained = responses @ variances * noise.scales_at(steps)
-    explained = np.minimum(explained, noise.largest_at(steps))
+    # Where a linearised rollout is not finite, it claims the most.
+    explained = np.fmin(explained, noise.largest_at(steps))
     return np.repeat(explained, stride, axis=0)[: len(windows)]
 
 
@@ -416,7 +417,7 @@ def _scales(
     """
     scales = _group_ratios(kinematics, squared, explained.mean(axis=0))
     for _ in range(_CUTS):
-        claimed = np.minimum(scales * explained, largest).mean(axis=0)
+        claimed = np.fmin(scales * explained, largest).mean(axis=0)
         scales = scales * _group_ratios(kinematics, squared, claimed)
     return scales
 
@@ -428,7 +429,7 @@ def _group_ratios(kinematics: Kinematics, squared: Array, claimed: Array) -> Arr
         actual = squared[:, columns].sum(axis=1, keepdims=True)
         total = claimed[:, columns].sum(axis=1, keepdims=True)
         ratios[:, columns] = np.where(
-            np.minimum(actual, total) > 0,
+            (np.minimum(actual, total) > 0) & np.isfinite(total),
             actual / np.maximum(total, _SMALLEST_VARIANCE),
             1.0,
         )

@@ -170,8 +170,7 @@ class Search:
             return
         self._consider_correction(self.best)
         # What is stable by half of the rows need not be so by all.
-        while self._is_unstable_by_all_rows(self.best):
-            # It falls behind, so that this ends: a constant state is never unstable.
+        while self._is_found_unstable_by_all_rows(self.best):
             self._unstable.add(self.best.nominal.key)
             self._consider_correction(self.best)
 
@@ -502,8 +501,13 @@ class Search:
         time_step = self._log.time_step
         return any(grows_outside(model, inputs, time_step) for model in models)
 
-    def _is_unstable_by_all_rows(self, structure: Structure) -> bool:
-        """Returns whether the model of all rows grows outside of its data."""
+    def _is_found_unstable_by_all_rows(self, structure: Structure) -> bool:
+        """Returns whether the model of all rows grows outside of its data.
+
+        Not of a structure of which that was known: one that is best nevertheless stays.
+        """
+        if structure.nominal.key in self._unstable:
+            return False
         fit = self._fits.fit_to_all_runs(structure)
         return self._is_unstable([fit.model])
 

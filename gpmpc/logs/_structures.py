@@ -17,7 +17,7 @@ a memory               a memory, or a fitted affine part, which its linear term 
 products of rows       no memory of as many rows; lags, as products see past inputs
 a delay of inputs      a delay, a memory (it knows the past inputs), or a still state
 first-order lags       lags, products, no input, or a still state without a memory
-a disturbance          a memory, whose means of outputs take its place
+a disturbance          a memory, whose means of outputs take its place in either order
 fitted on rollouts     no memory; a rigid body, whose weights are too many
 a group by past rows   no memory
 =====================  ================================================================
@@ -95,6 +95,7 @@ class Addition:
     extend: Callable[[LogModel], LogModel | None]
     for_control: bool = True  #: whether a controller can plan with it
     rows_back: int = 0  #: that it looks back on
+    is_disturbance: bool = False  #: whether a memory takes its place
 
 
 class GroupGP(NamedTuple):
@@ -189,7 +190,10 @@ class Structure:
         model = addition.extend(self.model)
         if model is None:
             return None
-        return replace(self, model=model, additions=(*self.additions, addition))
+        extended = (*self.additions, addition)
+        if not model.memory.empty:
+            extended = tuple(one for one in extended if not one.is_disturbance)
+        return replace(self, model=model, additions=extended)
 
     def with_gps(self, gps: Iterable[GroupGP]) -> "Structure":
         """Returns the structure with other GPs, in the order of their groups."""
@@ -541,7 +545,9 @@ def _with_disturbance(model: LogModel) -> LogModel | None:
     return replace(model, history=(DISTURBANCE_ROWS,) * len(model.history))
 
 
-_AFFINE_ADDITIONS = (Addition("disturbance", "disturbance", _with_disturbance),)
+_AFFINE_ADDITIONS = (
+    Addition("disturbance", "disturbance", _with_disturbance, is_disturbance=True),
+)
 
 
 def _with_force_disturbance(model: LogModel) -> LogModel | None:
@@ -576,9 +582,19 @@ def _multirotor(model: LogModel) -> MultirotorNominal:
 
 
 _MULTIROTOR_ADDITIONS = (
-    Addition("force_disturbance", "force disturbance", _with_force_disturbance),
+    Addition(
+        "force_disturbance",
+        "force disturbance",
+        _with_force_disturbance,
+        is_disturbance=True,
+    ),
     Addition("motor_torque", "motor torque", _with_motor_torque),
     Addition("feedback", "feedback", _with_feedback, for_control=False),
     Addition("lag", f"inputs {MOTOR_DELAY_ROWS} rows late", _with_motor_delay),
-    Addition("torque_disturbance", "torque disturbance", _with_torque_disturbance),
+    Addition(
+        "torque_disturbance",
+        "torque disturbance",
+        _with_torque_disturbance,
+        is_disturbance=True,
+    ),
 )

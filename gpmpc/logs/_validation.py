@@ -9,7 +9,7 @@ import numpy as np
 from gpmpc.exceptions import DataError
 from gpmpc.logs._fitting import PAST, NominalFit
 from gpmpc.logs._folds import MANY_RUNS, Fold
-from gpmpc.logs._log import Log
+from gpmpc.logs._log import Log, LogRun
 from gpmpc.logs._noise import as_flown, fit_noise, learning_gains, noise_steps
 from gpmpc.logs._rollout_corrections import (
     Averages,
@@ -137,7 +137,7 @@ class Validations:
         if key not in self._fold_rollouts:
             models = self._fits.models(structure)
             self._fold_rollouts[key] = [
-                self._rollouts(model, fold.held_out)
+                self._rollouts(model, _unseen(fold, model).held_out)
                 for model, fold in zip(models, self._folds, strict=True)
             ]
         return self._fold_rollouts[key]
@@ -226,6 +226,7 @@ class Validations:
             rows: Those of the fold, or a quarter of it.
             model: Without a correction.
         """
+        rows = _unseen(rows, model)
         return _Validation(
             fold=number,
             train=rows.train,
@@ -246,7 +247,14 @@ class Validations:
             for first in range(2):
                 held_out_runs = runs[first::2]
                 other_half = runs[1 - first :: 2]
-                train_runs = (*fold.train.runs, *other_half)
+                predicted = [
+                    run.part(self._past_rows, len(run), "predicted")
+                    for run in held_out_runs
+                    if len(run) > self._past_rows
+                ]
+                # The past of a short block may reach into one that is held out.
+                unseen = [_without_first(run, predicted, 0) for run in other_half]
+                train_runs = (*fold.train.runs, *unseen)
                 rows = Fold(
                     train=replace(fold.train, runs=train_runs),
                     held_out=replace(fold.held_out, runs=held_out_runs),
@@ -324,3 +332,33 @@ class Validations:
             shares=np.array(structure.correction_shares),
         )
         return replace(model, correction=correction)
+
+
+def _unseen(rows: Fold, model: LogModel) -> Fold:
+    """Returns a fold of whose held-out rows a model predicts none that it has seen.
+
+    Held-out blocks begin with the past that the most demanding structure needs, which
+    may be rows of the training. A model that looks back on fewer would predict some.
+    """
+    past = max(model.past, PAST)
+    runs = [
+        _without_first(run, rows.train.runs, kept=past + 1) for run in rows.held_out
+    ]
+    return rows._replace(held_out=replace(rows.held_out, runs=tuple(runs)))
+
+
+def _without_first(run: LogRun, others: Sequence[LogRun], kept: int) -> LogRun:
+    """Returns a run without its first rows, up to the last one that others have.
+
+    Args:
+        run: Which may be a part of a run of the log.
+        others: Likewise.
+        kept: So many of these rows stay.
+    """
+    name = run.origin or run.name
+    times = [other.time for other in others if (other.origin or other.name) == name]
+    if not times:
+        return run
+    shared = np.flatnonzero(np.isin(run.time, np.concatenate(times)))
+    first = max(shared.max(initial=-1) + 1 - kept, 0)
+    return run.part(first, len(run), "unseen") if first else run

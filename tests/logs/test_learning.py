@@ -504,6 +504,12 @@ def test_variances_that_explode_are_cut_off(flights):
     explained[0] = 1e4
     largest = 9 * squared
     scales = _scales(kinematics, squared, explained, largest)
+    # A linearised rollout that overflows leaves factors that can be saved.
+    for value in (np.inf, np.nan):
+        explained[0] = value
+        factors = _scales(kinematics, squared, explained, largest)
+        assert (np.isfinite(factors) & (factors > 0)).all()
+    explained[0] = 1e4
     claimed = np.minimum(scales * explained, largest)
     np.testing.assert_allclose(claimed.mean(axis=0), squared, rtol=1e-3)
     assert claimed[1].min() > 0.8

@@ -134,12 +134,37 @@ def with_memory(log, memory=ROWS):
 
 
 def test_noisy_rows_are_fitted_better_on_rollouts_than_one_step_ahead():
-    train = tanks(0, noise=0.05)
-    model = fitted_term(with_memory(train, Memory(rows=2)), train)
-    refined = refine_linear_term(model, train, steps=40)
-    windows = tanks(1, noise=0.0).windows(40, past=model.past)
-    errors = [np.abs(one.rollout_errors(windows)).mean() for one in (model, refined)]
-    assert errors[1] < 0.9 * errors[0]
+    found = []
+    for origin in (0.0, 300.0):  # such as that of kelvin
+        train = moved(tanks(0, noise=0.05), origin)
+        model = fitted_term(with_memory(train, Memory(rows=2)), train)
+        refined = refine_linear_term(model, train, steps=40)
+        windows = moved(tanks(1, noise=0.0), origin).windows(40, past=model.past)
+        errors = [
+            np.abs(one.rollout_errors(windows)).mean() for one in (model, refined)
+        ]
+        assert errors[1] < 0.9 * errors[0]
+        found.append(refined.weights[:, :-1])
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-4)
+
+
+def moved(log, origin):
+    """A log in units that begin elsewhere."""
+    runs = [replace(run, states=run.states + origin) for run in log]
+    return replace(log, runs=tuple(runs))
+
+
+def test_a_memory_takes_the_place_of_a_disturbance():
+    base = next(one for one in bases(tanks(0), 10) if one.base == CONSTANT_STATE)
+    by_key = {one.key: one for one in additions(base)}
+    with_disturbance = base.extended(by_key["disturbance"])
+    with_rows = base.extended(by_key["rows4"])
+    both = with_disturbance.extended(by_key["rows4"])
+    assert (both.name, both.key, both.size) == (
+        with_rows.name,
+        with_rows.key,
+        with_rows.size,
+    )
 
 
 def test_a_structure_has_the_same_penalties_in_every_fold():

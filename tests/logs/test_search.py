@@ -894,6 +894,29 @@ def test_a_runner_up_does_not_stand_for_the_baseline_of_its_name(monkeypatch):
     assert all(len(one.rollouts.windows) for one in validations)
 
 
+def test_a_search_ends_where_all_that_is_best_is_unstable(monkeypatch):
+    search = tiny_search(reactor_log(240))
+    monkeypatch.setattr(search, "_is_unstable", lambda models: True)
+    for name in ("_search_nominals", "_search_combinations", "_consider_correction"):
+        monkeypatch.setattr(search, name, lambda *structure: None)
+    for name in ("_starts_of_gps", "_starts_of_gps_of_past"):
+        monkeypatch.setattr(search, name, list)
+    search.run()
+    assert search.best.nominal.key in search._unstable
+
+
+@pytest.mark.parametrize("rows", [110, 240])
+def test_what_corrections_and_the_noise_are_fitted_to_was_held_out(rows):
+    search = tiny_search(log := reactor_log(rows))
+    start = next(one for one in search._structures.values() if one.size == 0)
+    for one in search._validations._validate(start):
+        seen = np.concatenate([run.time for run in one.train])
+        windows = one.held_out.windows(5, past=20)
+        for times in (one.rollouts.windows.times, windows.times):
+            predicted = times[:, None] + log.time_step * np.arange(1, 6)
+            assert not np.isclose(predicted[..., None], seen, atol=1e-6).any()
+
+
 @pytest.mark.parametrize("scale", [1.0, 2e7])
 def test_states_of_any_unit_are_corrected(scale):
     """A pressure of 200 bar in Pa is no rollout that diverged."""
