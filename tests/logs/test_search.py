@@ -26,7 +26,12 @@ from gpmpc.logs._held_out_errors import HeldOutErrors
 from gpmpc.logs._judging import _coverage_intervals, most_told_steps
 from gpmpc.logs._learning import _plan_folds
 from gpmpc.logs._log import LogRun
-from gpmpc.logs._noise import _nonnegative_solution, fit_noise, learning_gains
+from gpmpc.logs._noise import (
+    _nonnegative_solution,
+    fit_noise,
+    learning_gains,
+    noise_steps,
+)
 from gpmpc.logs._ranges import ranges_of
 from gpmpc.logs._rollout_corrections import (
     _PRIORS,
@@ -598,7 +603,7 @@ def test_noise_is_known_as_far_as_rollouts_reach():
     kinematics = Increments(log.space)
     still = AffineNominal(kinematics, fitted=False)
     model = LogModel(kinematics, still, np.empty(0), history=(0, 0))
-    noise = fit_noise([model], [log], longest=120)
+    noise = fit_noise([model], [log], noise_steps(120))
     assert noise.steps[-4:] == (50, 70, 100, 120)
     largest = noise.largest_at((50, 120))
     assert (largest[1] > 1.5 * largest[0]).all()
