@@ -112,12 +112,13 @@ class Foresight:
     def __init__(self, controller: GPMPC):
         self.controller = controller
         self.meter = StageMeter(controller.prediction.problem, controller.horizon)
-        self.longest = max(_HORIZONS * controller.horizon, _STAGES)
+        self.longest = max(_HORIZONS * controller.horizon, _STAGES)  # stages
         self._model = controller.prediction.model
         self._roll_out = RollOut(self._model)
         holding_stages = max(_FEWEST, controller.horizon // _HOLDING_PART)
-        # No plan is longer than its horizon.
+        # Stages for which the goal is to be held; no plan is longer than its horizon.
         self._holding_stages = min(holding_stages, controller.horizon)
+        # The cost of a stage that is as good as free.
         self._negligible = _negligible_cost(controller.prediction.problem)
         horizons = (controller.horizon // 2, controller.horizon // 4)
         shorter = [

@@ -310,7 +310,14 @@ def _linear_plant(
 ) -> _Plant:
     """Returns the plant at a point.
 
-    As many of its last inputs are states as the controller knows of.
+    As many of its last inputs are states as the controller knows of:
+
+        states of ``plant`` (p,)          | last inputs (count m,)
+        own, further and queue, any order | the oldest first
+
+    ``own`` are those that the controller's model has, too; ``further`` are the plant's
+    alone; ``queue`` are inputs on their way to it. Of the controller's states (n,),
+    ``observed`` are own states, and ``pending`` are inputs on their way.
     """
     model = prediction.model
     n, m = point.B.shape

@@ -26,10 +26,13 @@ class Situation:
 
     belief: Gaussian  #: over the model's whole state
     reference: Reference  #: of it
-    #: mean of the belief, or what was predicted where nothing was measured (n,); None
-    #: of models without a past, and before the first measurement
+    #: what the next step's past follows from (n,): mean of the belief, or what was
+    #: predicted where nothing was measured; None where nothing is to follow, of models
+    #: without a past, and where nothing is known yet, before the first measurement
     state: Array | None = None
-    measured_dim: int | None = None  #: None where all of the state is measured
+    #: as many first states are measured; None where all are, as of models without a
+    #: past
+    measured_dim: int | None = None
 
     @classmethod
     def of(

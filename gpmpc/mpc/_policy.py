@@ -468,11 +468,11 @@ def _conclude(
     status = Status.INVALID_MEASUREMENT if decision is None else decision.status
     reason = status.advice
     readable = _readable(controller, decision, situation, last)
-    plan = None
+    admitted = None
     if readable is not None and readable.applicable:
-        plan = _admit(controller, readable, last)
-    if plan is not None:
-        return _command(plan, status, decision=plan, situation=situation)
+        admitted = _admit(controller, readable, last)
+    if admitted is not None:
+        return _command(admitted, status, decision=admitted, situation=situation)
     if decision is not None and decision.applicable:  # it is refused
         reason = (
             f"its plan, {status.name}, is not finite or out of its bounds or shape; "
@@ -541,7 +541,9 @@ def _plan_of_policy(
     None where there is none to be applied. What an input that was held once leads to is
     not planned: the plan then counts as used up.
     """
-    if last is None or last.plan is None or not last.plan.applicable:
+    if last is None or last.plan is None:
+        return None
+    if not last.plan.applicable:  # it was applied before any plan, without prediction
         return None
     plan = _shifted(last.plan)
     if on_failure == "hold" and plan.policy_steps > 1:

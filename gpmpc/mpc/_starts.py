@@ -14,6 +14,9 @@ as a whole, and followed under its feedback.
                   is left of that                                   (``_Pursuit``)
     question      what a controller is asked at any state           (``Question``)
     arguments     those of ``control`` at one step                  (``_StepArguments``)
+
+The arguments are what the user asks at one step, with the state and the last decision;
+the question is what stays the same of them along a flight, whose states are many.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -165,11 +168,12 @@ class _Pursuit(NamedTuple):
         """What is still to be paid once the first stage of the plan was flown."""
         return self.remaining.less(self.costs[:1].sum())
 
-    def after_failed_steps(self, decision: Decision, horizon: int) -> "_Pursuit":
+    def moved_to(self, decision: Decision, horizon: int) -> "_Pursuit":
         """Returns it with its plan and flight from a decision's step on.
 
-        A failed step may have left stages behind, which are paid by now. Of a flight
-        that is no longer than a horizon a plan of H stages sees as much: it is dropped.
+        That is its own step, unless steps failed since: stages that these have left
+        behind are paid by now. Of a flight that is no longer than a horizon a plan of H
+        stages sees as much: it is dropped.
         """
         # Means of a plan that was shifted are rows of it: equal to the digit.
         is_now = (self.states == decision.means[0]).all(axis=1)
@@ -571,7 +575,7 @@ class ManyStarts:
         n = self.problem.state_dim
         if not np.array_equal(previous.pursuit.goal[:n], arguments.end[:n]):
             return None
-        return previous.pursuit.after_failed_steps(previous, self.horizon)
+        return previous.pursuit.moved_to(previous, self.horizon)
 
     def _needs_new_search(self, costs: FlownCosts, pursuit: _Pursuit | None) -> bool:
         """Tells whether a plan with the costs of its stages is to be searched anew."""

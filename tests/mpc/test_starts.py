@@ -704,7 +704,7 @@ def test_after_failed_steps_a_plan_is_compared_stage_by_stage(failed_steps):
     pursuit = _Pursuit.of_plan(np.zeros(2), costs(0), states[:6])
     previous = one.control(Gaussian.certain(states[0]), Reference(np.zeros(2)))
     previous = replace(previous, means=states[failed_steps : failed_steps + 6])
-    pursuit = pursuit.after_failed_steps(previous, horizon=5)
+    pursuit = pursuit.moved_to(previous, horizon=5)
     now = failed_steps + 1
     assert pursuit.costs.total.tolist() == stages[failed_steps:5].tolist()
     assert not many._needs_new_search(costs(now), pursuit)
