@@ -57,12 +57,12 @@ class ModelLoop:
     time_step: float = cast(float, None)
 
     def __post_init__(self) -> None:
-        check_next_states(self.model)
-        check_method("propagator", self.propagator, "propagate", "Linearization()")
         signals = signals_of(self.model)
         if self.time_step is None:
             object.__setattr__(self, "time_step", signals.time_step or 1.0)
         check_number("time_step", self.time_step, above=0, unit="[s]")
+        check_next_states(self.model)
+        check_method("propagator", self.propagator, "propagate", "Linearization()")
         loop = Signals(time_step=self.time_step)
         signals.check("the model", loop, "the model loop", "time_step")
 
