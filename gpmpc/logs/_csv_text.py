@@ -32,7 +32,7 @@ _SAMPLE = 50  # lines by which the text is recognised
 _LONGEST_HEAD = 1000  # lines in which rows are looked for,
 _LARGEST_HEAD = 2**18  # and characters
 _COMMENTS = 50  # before the first line that may hold the names of the columns
-_HEADER = 2  # lines before the rows that may hold the names, and the units
+_NAME_LINES = 2  # lines before the rows that may hold the names, and the units
 _START = 1000  # bytes that the encoding is looked for in
 _ENCODING_MARKS = (  # the longer marks first: that of UTF-32 begins as that of UTF-16
     (codecs.BOM_UTF32_LE, "utf-32"),
@@ -81,7 +81,7 @@ class CsvText(NamedTuple):
         return self.stream.lines.is_cut
 
 
-class _Header(NamedTuple):
+class _ColumnNames(NamedTuple):
     """The names of the columns and their units, and the count of the other lines."""
 
     names: Fields
@@ -109,24 +109,24 @@ def open_csv(where: str, file: io.BufferedReader) -> CsvText:
         )
     delimiter = _find_delimiter(head[-_SAMPLE:])
     fields = [_split_line(line, delimiter) for line in head]
-    first = _first_row(fields, delimiter)
-    rows = fields[first:]
+    first_row = _first_row(fields, delimiter)
+    rows = fields[first_row:]
     if delimiter == ",":
-        _check_decimal_commas(where, fields[first - 1 : first], rows)
-    header = _find_header(head[:first], lines.comments, rows, delimiter)
-    columns = max([len(header.names), *map(len, rows)])
+        _check_decimal_commas(where, fields[first_row - 1 : first_row], rows)
+    column_names = _find_names(head[:first_row], lines.comments, rows, delimiter)
+    columns = max([len(column_names.names), *map(len, rows)])
     decimal = _decimal_mark(rows)
     width = columns if delimiter == WHITE_SPACE else 0
     return CsvText(
-        stream=_CsvStream(head[first:], lines, width),
-        names=header.names,
-        units=header.units,
+        stream=_CsvStream(head[first_row:], lines, width),
+        names=column_names.names,
+        units=column_names.units,
         columns=columns,
         delimiter=delimiter,
         decimal=decimal,
         doubtful=doubtful_columns(rows, decimal),
-        skipped=header.skipped,
-        lines_before_rows=first,
+        skipped=column_names.skipped,
+        lines_before_rows=first_row,
     )
 
 
@@ -374,12 +374,12 @@ def _counts_from_zero(fields: Fields, below: Fields) -> bool:
     return len(counted) > 2 and fields == counted and any("." in one for one in below)
 
 
-def _find_header(
+def _find_names(
     lines: Sequence[str],
     comments: Sequence[str],
     rows: Sequence[Fields],
     delimiter: str,
-) -> _Header:
+) -> _ColumnNames:
     """Finds the names of the columns before the rows.
 
     Args:
@@ -389,20 +389,20 @@ def _find_header(
         delimiter: Of the rows.
     """
     if not rows:
-        return _Header(_split_line(lines[0], delimiter), units=[], skipped=0)
+        return _ColumnNames(_split_line(lines[0], delimiter), units=[], skipped=0)
     last = _split_line(lines[-1], delimiter) if lines else []
     if lines and (_counts_columns(last) or _counts_from_zero(last, rows[0])):
         # other numbers than a mapping counts by
-        return _Header([], units=[], skipped=len(lines))
+        return _ColumnNames([], units=[], skipped=len(lines))
     for separators in ((delimiter,), DELIMITERS):
-        names, units = _last_names(lines[-_HEADER:], rows, separators)
+        names, units = _last_names(lines[-_NAME_LINES:], rows, separators)
         if names:
             understood = 2 if units else 1
-            return _Header(names, units, skipped=len(lines) - understood)
+            return _ColumnNames(names, units, skipped=len(lines) - understood)
         names, units = _last_names(comments, rows, separators)
         if names:
-            return _Header(names, units, skipped=len(lines))
-    return _Header([], units=[], skipped=len(lines))
+            return _ColumnNames(names, units, skipped=len(lines))
+    return _ColumnNames([], units=[], skipped=len(lines))
 
 
 def _last_names(

@@ -41,9 +41,10 @@ def changes_between_rows(samples: Samples, rows: Samples, step: float) -> bool:
     usable = np.isfinite(from_slope).all(axis=1)
     if not usable.any():
         return False
-    nearest = np.minimum(_size(from_row[usable]), _size(from_slope[usable]))
+    # of a whole column, from the held value or from the line: from what is nearer
+    departure = np.minimum(_size(from_row[usable]), _size(from_slope[usable]))
     spread = np.nanstd(samples.values, axis=0)
-    return bool((nearest > LARGEST_CHANGE * spread).any())
+    return bool((departure > LARGEST_CHANGE * spread).any())
 
 
 def _size(deviations: Array) -> Array:

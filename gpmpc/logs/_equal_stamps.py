@@ -48,12 +48,13 @@ def merge_rows(
         return rows
     moments = moments[is_shared]
     by_stamp = values.groupby([moments["part"], moments["stamp"]])
+    # Below, rows are those that share their stamp with another one.
     numbers = by_stamp.ngroup().to_numpy()  # of the stamp of each row
     has_one_value = (by_stamp.nunique() <= 1).all(axis=1).to_numpy()
     is_first = ~moments.duplicated().to_numpy()
     filled = by_stamp.bfill()
     is_filled = (values.isna() & filled.notna()).any(axis=1).to_numpy()
-    gains = np.zeros(len(has_one_value), dtype=bool)
+    gains = np.zeros(len(has_one_value), dtype=bool)  # of the stamps
     gains[numbers[is_first & is_filled]] = True
     is_merged = (has_one_value & gains)[numbers]
     count = int((is_merged & ~is_first).sum())

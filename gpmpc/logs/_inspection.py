@@ -49,8 +49,8 @@ from gpmpc.logs._row_times import (
     fault_of_seconds,
     read_dates,
     row_times,
+    time_column_beside_signals,
     time_unit,
-    unread_times,
     usual_time_column,
 )
 from gpmpc.logs._runs import split_into_runs
@@ -104,7 +104,7 @@ class _Times(NamedTuple):
 
     stamps: Array  # (K,) [s]; the numbers of the rows where nothing says more
     column: str = ""  # that holds them
-    are_rows: bool = False
+    count_rows: bool = False
     doubt: str = ""  # about their unit, in words
 
 
@@ -438,11 +438,11 @@ def _times_of(
     else:
         named = usual_time_column(table)
         if mapping is not None:
-            named = unread_times(table, mapping)
+            named = time_column_beside_signals(table, mapping)
         if named != "timestamp" or source.topic:  # the mapping's is of ``timestamp``
             unit = ""
     if not named:
-        return _Times(np.arange(len(table), dtype=float), are_rows=True)
+        return _Times(np.arange(len(table), dtype=float), count_rows=True)
     if holds_times(table, named):
         return _Times(read_column(str(path), table, named), column=named)
     dates = read_dates(table, named)
@@ -503,7 +503,7 @@ def _summary(
     return {
         "stream": title,
         "rows": rows,
-        "rate [Hz]": np.nan if times.are_rows else steps.rate,
+        "rate [Hz]": np.nan if times.count_rows else steps.rate,
         "jitter": steps.jitter,
         "gaps": len(steps.gaps),
         "longest gap [s]": steps.longest_gap,
@@ -518,7 +518,7 @@ def _stream_warnings(
 ) -> list[str]:
     """Says what is wrong with the stamps of a stream."""
     of_topic = f" of {title}" if title else ""
-    if times.are_rows:
+    if times.count_rows:
         return [
             f"no column{of_topic} is called as times are: values stand over their rows "
             "(--time COLUMN or --time-step SECONDS says more; in a mapping, time: NAME "
@@ -560,7 +560,7 @@ def _time_hints(
         f"time: {{step: {name}}}"
         for name, value in constants.items()
     ]
-    if not times.are_rows:
+    if not times.count_rows:
         return hints
     for name in numbers:
         steps = np.diff(source.table[name].to_numpy(float))

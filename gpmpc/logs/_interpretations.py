@@ -73,7 +73,9 @@ class Interpretation:
     """One interpretation of all columns, and how the three relations fit it."""
 
     attitude: AttitudeInterpretation
-    position: Array  # axes and unit of the true position in the columns (3, 3)
+    #: the columns of the position are this matrix (3, 3), of axes and a unit, times the
+    #: true position
+    position: Array
     velocity: AxisFit  # to the changes of the position as it is read
     rate: AxisFit
     velocity_frame: str
@@ -118,16 +120,16 @@ class InterpretationSearch:
         best_score = claimed.score
         in_world = self._fit_world_velocity()
         positions = _positions_to_try(in_world)
-        best_velocity = self._best_velocity_score(claimed, in_world)
-        best_tilt = 2 * np.log(FLOOR_TILT)
+        velocity_bound = self._velocity_bound(claimed, in_world)
+        tilt_bound = 2 * np.log(FLOOR_TILT)
         least_agreement = self._least_agreement(claimed)
         attitudes = self.relations.attitudes
         for attitude, rate_frame in itertools.product(attitudes, ("body", "world")):
             rate = self._fit_rate(attitude, rate_frame, least_agreement)
             if rate is None:
                 continue
-            least_rate = self._least_rate_score(attitude, rate_frame, rate)
-            if least_rate + best_velocity + best_tilt > best_score:
+            rate_bound = self._rate_bound(attitude, rate_frame, rate)
+            if rate_bound + velocity_bound + tilt_bound > best_score:
                 continue
             body_axis = self.relations.body_axis(attitude)
             frames = ["world"]
@@ -181,13 +183,13 @@ class InterpretationSearch:
             return None
         return fit_axes_and_lag(series, derived, self.rate_factors, FLOOR_RATE)
 
-    def _best_velocity_score(self, claimed: Interpretation, in_world: AxisFit) -> float:
+    def _velocity_bound(self, claimed: Interpretation, in_world: AxisFit) -> float:
         """Returns the log misfit of the velocity, or a bound of it from below."""
         if self._may_be_body_velocity(self.relations.claimed_attitude, claimed):
             return float(3 * np.log(FLOOR_VELOCITY))
         return in_world.log_misfit
 
-    def _least_rate_score(
+    def _rate_bound(
         self, attitude: AttitudeInterpretation, rate_frame: str, rate: AxisFit
     ) -> float:
         """Returns a bound of the score of attitude and rate, from below."""

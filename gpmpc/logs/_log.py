@@ -57,7 +57,8 @@ class LogRun:
     ) -> np.ndarray:
         """Lists rows with ``past`` rows before and ``ahead`` after in their piece.
 
-        Those of pieces that have room for ``longest`` rows after have as many.
+        Starts in a piece of more than ``past + longest`` rows have ``longest`` rows
+        after them as well, so that windows of several lengths begin in the same rows.
         """
         starts = []
         for begin, end in self.pieces:

@@ -35,7 +35,9 @@ _PLAIN_KEYS = (  # whose values are taken as they are
     "model",
     "stamp",
 )
-_AXES_KEY = "frame"  # as files call the axes of all states
+# as files call the axes of all states, enu or ned; the ``frame`` of a signal is another
+# thing: the world's or the body's
+_AXES_KEY = "frame"
 _SIGNAL_KEYS = (
     "columns",
     "unit",

@@ -110,7 +110,7 @@ class MotionRelations:
         It was read as one in the claimed frame: NED becomes ENU by another change of
         the axes than FRD becomes FLU.
         """
-        claimed = self.claim.to_enu(signal, claimed_frame)
+        claimed = self.claim.to_enu(signal, claimed_frame)  # its own inverse
         return claimed @ self.claim.to_enu(signal, frame)
 
     def velocities(
@@ -261,6 +261,7 @@ class MotionRelations:
         rises = (
             series.later[2 * half_width :] - series.later[: -2 * half_width]
         ) / span
+        # an acceleration is known at lags that have half a window on both sides
         lags = series.lags[half_width:-half_width]
         if np.isfinite(rises[len(lags) // 2]).all(axis=1).sum() < FEWEST:
             return 0.0
@@ -268,15 +269,15 @@ class MotionRelations:
         accelerations = lagged_vectors(lags, rises)
         leans = np.column_stack([body_axis[:, :2], np.zeros(len(body_axis))])
         correlations = lagged_correlations(accelerations, leans)
-        lag = int((correlations[:, 0, 0] + correlations[:, 1, 1]).argmax())
-        rows = accelerations.inside[lag]
-        if abs(lags[lag]) < LEAST_CLOCK_LAG or rows.sum() < FEWEST:
+        best = int((correlations[:, 0, 0] + correlations[:, 1, 1]).argmax())
+        rows = accelerations.inside[best]
+        if abs(lags[best]) < LEAST_CLOCK_LAG or rows.sum() < FEWEST:
             return 0.0
-        tilt = tilt_misfits(rises[lag][rows], body_axis[rows])
+        tilt = tilt_misfits(rises[best][rows], body_axis[rows])
         if tilt is None or not fits_tilt(tilt):
             return 0.0
         is_better = (tilt < BETTER_RATIO * claimed_tilt).any()
-        return float(lags[lag]) if is_better else 0.0
+        return float(lags[best]) if is_better else 0.0
 
 
 def _lag_of_best_correlation(series: LaggedVectors, derived: Array) -> float:

@@ -1,4 +1,10 @@
-"""Makes the times of rows: of their stamps, or of a constant step without stamps."""
+"""Makes the times of rows: of their stamps, or of a constant step without stamps.
+
+- Messages of bags have the column ``STAMP`` in s, of their headers or of the log.
+- Topics of PX4's logs have ``timestamp``, which their reader brings to s.
+- Tables of other files have any column, in any unit: ``time`` in the mapping, or
+  ``timestamp``, or those of ``TIMES``, which only tell that there are times.
+"""
 
 import numpy as np
 import pandas as pd
@@ -261,10 +267,10 @@ def counts_rows(table: pd.DataFrame, mapping: LogMapping) -> bool:
         return False
     if mapping.time_step is not None:
         return True
-    return mapping.rate is not None and not unread_times(table, mapping)
+    return mapping.rate is not None and not time_column_beside_signals(table, mapping)
 
 
-def unread_times(table: pd.DataFrame, mapping: LogMapping) -> str:
+def time_column_beside_signals(table: pd.DataFrame, mapping: LogMapping) -> str:
     """Returns the time column of a table that no signal reads; empty without one.
 
     One that is a signal, such as t of a temperature, is no time.

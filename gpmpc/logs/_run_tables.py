@@ -35,9 +35,9 @@ from gpmpc.logs._row_times import (
     doubt_of_unit,
     read_times,
     row_times,
+    time_column_beside_signals,
     unit_of_clock,
     unit_text,
-    unread_times,
 )
 from gpmpc.logs._signals import nan_zero_dropouts, read_column, read_signal
 from gpmpc.logs._units import conversion, is_known, unit_of_time, units_of
@@ -100,7 +100,7 @@ def tabulate(
             signal,
             findings,
             is_kept=is_kept,
-            follows=_following_rows(topic.stamps),
+            is_next_step=_are_next_steps(topic.stamps),
         )
         samples = Samples(topic.stamps.time, values)
         columns.append(_signal_on_grid(samples, grid, signal, mapping, findings))
@@ -138,8 +138,9 @@ def _read_topic(
     columns = [column for signal in signals for column in signal.columns]
     rows = TimedRows(table, times)
     table, times = merge_rows(rows, [*columns, *mapping.keep], findings)
+    is_only_table = not topic  # topics have their clock in common with others
     stamps = ordered_stamps(
-        times, where, hint, may_restart=not topic, max_gap=mapping.max_gap
+        times, where, hint, may_restart=is_only_table, max_gap=mapping.max_gap
     )
     ordered = table.iloc[stamps.rows]
     if counts_rows(table, mapping):
@@ -291,7 +292,7 @@ def _note_unit_of_time(
 
 def _without_times(table: pd.DataFrame, mapping: LogMapping) -> str:
     """Says that a mapping says no times, and what it may say."""
-    column = unread_times(table, mapping)
+    column = time_column_beside_signals(table, mapping)
     if not column:
         return (
             "the mapping names no column of stamps (time: NAME) and no constant step "
@@ -454,7 +455,11 @@ def _rows_outside(
 
 
 def _kept_rows(topic: _Topic, mapping: LogMapping) -> np.ndarray:
-    """Finds the rows (K,) of a topic inside the ranges of ``keep`` that it holds."""
+    """Finds the rows (K,) of a topic inside the ranges of ``keep`` that it holds.
+
+    The others are left out of checks here, and of the log by ``_rows_outside``, once
+    all signals are on one grid.
+    """
     is_kept = np.ones(len(topic.table), dtype=bool)
     for column, (low, high) in mapping.keep.items():
         if column in topic.table:
@@ -463,7 +468,7 @@ def _kept_rows(topic: _Topic, mapping: LogMapping) -> np.ndarray:
     return is_kept
 
 
-def _following_rows(stamps: Stamps) -> np.ndarray:
+def _are_next_steps(stamps: Stamps) -> np.ndarray:
     """Finds the rows (K,) that stand a usual time step behind the row before."""
     steps = np.diff(stamps.time)
     if not len(steps):

@@ -100,7 +100,7 @@ def read_signal(
     signal: Signal,
     findings: RunFindings,
     is_kept: np.ndarray,
-    follows: np.ndarray,
+    is_next_step: np.ndarray,
 ) -> Array:
     """Reads a signal (K, c) in the units and conventions of ``gpmpc.logs``.
 
@@ -110,7 +110,7 @@ def read_signal(
         signal: Says which columns, and in which units.
         findings: Takes what is missing.
         is_kept: Rows (K,) that will not be left out: no other has to be right.
-        follows: Rows (K,) that stand a usual time step behind the row before.
+        is_next_step: Rows (K,) that stand a usual time step behind the row before.
 
     Raises:
         DataError: A column cannot be read, angles are rather in degrees, or quaternions
@@ -128,9 +128,9 @@ def read_signal(
     if signal.kind == "quaternion":
         return _unit_quaternions(where, values, signal, findings, is_kept)
     kept_values = np.where(is_kept[:, None], values, np.nan)
-    _check_angles(where, kept_values, signal, findings, follows)
-    _note_turns(values, signal, findings, follows)
-    _note_undeclared_angles(values, signal, findings, follows)
+    _check_angles(where, kept_values, signal, findings, is_next_step)
+    _note_turns(values, signal, findings, is_next_step)
+    _note_undeclared_angles(values, signal, findings, is_next_step)
     if signal.kind == "euler":
         return _euler_to_quaternions(values, present=~absent)
     return values
@@ -152,7 +152,7 @@ def _check_angles(
     values: Array,
     signal: Signal,
     findings: RunFindings,
-    follows: np.ndarray,
+    is_next_step: np.ndarray,
 ) -> None:
     """Notes angles that are said to be radians and are large: they may be degrees.
 
@@ -173,7 +173,7 @@ def _check_angles(
     )
     is_tilt = signal.kind == "euler" and largest[:2].max() > LARGEST_ANGLE
     changes = np.diff(values, axis=0)
-    changes[~follows[1:]] = np.nan
+    changes[~is_next_step[1:]] = np.nan
     if is_tilt or _count_jumps(changes) >= FEWEST_JUMPS:
         raise DataError(f"{where}: {text}")
     count = int((np.abs(values) > LARGEST_ANGLE).any(axis=1).sum())
@@ -181,7 +181,7 @@ def _check_angles(
 
 
 def _note_turns(
-    values: Array, signal: Signal, findings: RunFindings, follows: np.ndarray
+    values: Array, signal: Signal, findings: RunFindings, is_next_step: np.ndarray
 ) -> None:
     """Notes angles of inputs and context that jump by a turn: they are plain numbers.
 
@@ -189,7 +189,7 @@ def _note_turns(
     """
     if signal.kind != "angle" or signal.role == "states":
         return
-    jumps = np.abs(np.diff(values, axis=0)[follows[1:]]) > np.pi
+    jumps = np.abs(np.diff(values, axis=0)[is_next_step[1:]]) > np.pi
     text = (
         f"{signal.name} jumps by a turn {jumps.sum()} times, and is no state: models "
         "take it as a plain number; log its sine and cosine, or count its turns"
@@ -198,7 +198,7 @@ def _note_turns(
 
 
 def _note_undeclared_angles(
-    values: Array, signal: Signal, findings: RunFindings, follows: np.ndarray
+    values: Array, signal: Signal, findings: RunFindings, is_next_step: np.ndarray
 ) -> None:
     """Notes columns that jump by whole turns, and that no ``kind`` calls angles.
 
@@ -208,7 +208,7 @@ def _note_undeclared_angles(
     may_be_angles = signal.group.unit in ("rad", "")
     if signal.kind != "vector" or not may_be_angles:
         return
-    behind = np.flatnonzero(follows)
+    behind = np.flatnonzero(is_next_step)
     present = np.isfinite(values[behind]) & np.isfinite(values[behind - 1])
     for column, name in enumerate(signal.columns):
         rows = behind[present[:, column]]
