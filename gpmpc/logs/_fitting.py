@@ -35,7 +35,8 @@ STEPS = 50  # of the rollouts that models are judged by
 _JUDGED = (1, 10, 50)  # steps after the starts of rollouts whose errors decide
 PAST = 20  # rows before them
 _WINDOWS = 300
-_EVALUATIONS = 15
+# Of a search, at most: few need ten, and one that stops before its end is no fit.
+_EVALUATIONS = 100
 _COUNTED_STEPS = 8  # steps of a rollout whose errors count
 _BATCH = 40_000  # states of one batch of rollouts: parameter vectors times windows
 _FEWEST_BLOCKS = 8  # of consecutive windows, whose errors are correlated

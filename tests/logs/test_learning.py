@@ -25,6 +25,7 @@ from gpmpc.logs import (
     read_log,
     save_learned,
 )
+from gpmpc.logs._fitting import _minimize
 from gpmpc.logs._judging import check_learned, most_steps, short_pieces
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._noise import _scales, error_variances, follow_errors
@@ -114,6 +115,24 @@ def test_parameters_come_back_within_their_standard_errors(flights):
             bound = 4 * error + 0.05 * abs(value)
             assert abs(estimate - value) < bound, (name, estimate, error)
         assert 0 < estimates["torque_x1"][1] < 5
+
+
+class _Valley:
+    """Residuals along whose curved valley a search takes many steps (Rosenbrock)."""
+
+    bounds = (np.full(2, -np.inf), np.full(2, np.inf))
+
+    def __call__(self, theta):
+        x, y = theta
+        return np.array([10 * (y - x**2), 1 - x])
+
+    def jacobian(self, theta):
+        return np.array([[-20 * theta[0], 10.0], [-1.0, 0.0]])
+
+
+def test_a_search_of_parameters_goes_on_to_its_end():
+    found = _minimize(_Valley(), np.array([-3.0, 1.0]))
+    np.testing.assert_allclose(found, 1, rtol=1e-3)
 
 
 def test_learning_finds_motors_and_noise_and_beats_baselines(flights):
