@@ -6,6 +6,8 @@
   ``timestamp``, or those of ``TIMES``, which only tell that there are times.
 """
 
+import re
+
 import numpy as np
 import pandas as pd
 
@@ -27,8 +29,8 @@ from gpmpc.logs._units import (
 
 # columns that hold the time where nobody says which
 TIMES = (STAMP, *NAMES_OF_TIMES)
-_CLOCK = r"\s*\d+:\d\d:\d\d(?:\.\d+)?\s*"
-_WITH_UNIT = r"^\s*(-?\d+(?:\.\d+)?)\s*([^\W\d_]+)\s*$"
+_CLOCK = re.compile(r"\s*\d+:\d\d:\d\d(?:\.\d+)?\s*")
+_WITH_UNIT = re.compile(r"^\s*(-?\d+(?:\.\d+)?)\s*([^\W\d_]+)\s*$")
 _SAMPLE = 50  # rows in which texts are looked at: are they dates?
 _SAME_SPAN = 0.02  # of the time that a log took: a clock in its messages goes as far
 LATEST_UNSTATED = 1e11  # [s] since 1970, in the year 5138
@@ -219,7 +221,12 @@ def read_dates(table: pd.DataFrame, column: str) -> Array | None:
 def _read_durations(texts: pd.Series) -> Array | None:
     """Reads durations (K,) [s] that are texts; None of anything else."""
     present = texts.dropna()
-    if not len(present) or not all(isinstance(text, str) for text in present):
+    first = present.iloc[0] if len(present) else None
+    if not isinstance(first, str) or not (
+        _CLOCK.match(first) or _WITH_UNIT.match(first)
+    ):
+        return None
+    if not all(isinstance(text, str) for text in present):
         return None
     if present.str.fullmatch(_CLOCK).all():
         return seconds(pd.to_timedelta(texts))
