@@ -160,9 +160,9 @@ def inspect_log(
         path: In a format of ``read_log``.
         mapping: Says which columns matter, which is the time, and what are states and
             inputs; all numbers by default.
-        time: Column of the stamps [s], where there is no mapping; by default one of
-            ``TIMES`` or with a unit in its name, and where there is none, values stand
-            over their rows.
+        time: Column of the stamps, where there is no mapping, in the unit that the
+            file says or in s; by default one of ``TIMES``, with a unit in its name or
+            of dates, and where there is none, values stand over their rows.
         time_step: The constant step of rows without stamps [s], likewise.
 
     Raises:
