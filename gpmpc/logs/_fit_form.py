@@ -13,6 +13,7 @@ from gpmpc.logs._fitting import (
     fit_nominal,
     judged_steps,
     mean_logarithm,
+    rows_before,
 )
 from gpmpc.logs._linear_terms import (
     fit_linear_term,
@@ -149,7 +150,7 @@ class _LagTrials:
     def __init__(self, model: LogModel, log: Log, steps: int):
         self._model = model
         self._log = log
-        self._windows = log.windows(steps, past=max(model.past, PAST), most=_WINDOWS)
+        self._windows = log.windows(steps, past=rows_before(model), most=_WINDOWS)
         self._steps = judged_steps(steps, finer=_ALSO_JUDGED)
         self._at_rest = distances_at_rest(self._windows, self._steps)
 

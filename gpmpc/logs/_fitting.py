@@ -69,6 +69,14 @@ class NominalFit:
         return [row for row in rows if row[0]]
 
 
+def rows_before(model: LogModel) -> int:
+    """Returns the rows that windows have before a start, of a model and of baselines.
+
+    Those of ``past_rows_needed`` are enough for all structures of a search instead.
+    """
+    return max(model.past, PAST)
+
+
 def judged_steps(steps: int, finer: Sequence[int] = ()) -> tuple[int, ...]:
     """Returns the steps whose errors decide, of rollouts of so many steps.
 
@@ -115,27 +123,29 @@ def fit_nominal(
     count = len(model.nominal.parameter_names)
     if theta0.shape != (count,):
         raise ShapeError(f"theta0 must have {count} entries; got {theta0.shape}")
-    windows = log.windows(steps, past=max(model.past, PAST), most=_WINDOWS)
-    lags = len(model.time_constants)
-    theta0 = np.concatenate([theta0, np.full(lags, _first_lag(log.time_step))])
-    bounds = _bounds(model, lags)
-    if not ((bounds[0] <= theta0) & (theta0 <= bounds[1])).all():
+    windows = log.windows(steps, past=rows_before(model), most=_WINDOWS)
+    lag_count = len(model.time_constants)
+    # Parameters, then the time constants of first-order lags.
+    first_lag = _first_lag(log.time_step)
+    search_start = np.concatenate([theta0, np.full(lag_count, first_lag)])
+    bounds = _bounds(model, lag_count)
+    if not ((bounds[0] <= search_start) & (search_start <= bounds[1])).all():
         rule = "must lie between the parameters' bounds"
-        raise SettingError("theta0", f"{rule}; got {theta0[:count].tolist()}")
-    if not len(theta0):
+        raise SettingError("theta0", f"{rule}; got {theta0.tolist()}")
+    if not len(search_start):
         return NominalFit(replace(model, theta=theta0), standard_errors=theta0)
-    sizes = np.where(theta0 != 0, np.abs(theta0), 1.0)
+    sizes = np.where(search_start != 0, np.abs(search_start), 1.0)
     residuals = _RolloutResiduals(model, windows, steps, bounds, sizes)
-    theta = _minimize(residuals, theta0)
-    if lags and theta[count:].min() <= 0 and theta0[-1] > log.time_step:
+    theta = _minimize(residuals, search_start)
+    if lag_count and theta[count:].min() <= 0 and first_lag > log.time_step:
         # The search jumped below zero. There lags act as none (``FirstOrderLags``), and
         # nothing pulls them back.
-        from_a_step = np.concatenate([theta0[:count], np.full(lags, log.time_step)])
+        from_a_step = np.concatenate([theta0, np.full(lag_count, log.time_step)])
         theta = min(theta, _minimize(residuals, from_a_step), key=residuals.loss)
     J = residuals.jacobian(theta)
     # The search moves what has no effect as well, anywhere: it is put back.
     has_effect = J.any(axis=0) | (np.arange(len(theta)) >= count)
-    theta = np.where(has_effect, theta, theta0)
+    theta = np.where(has_effect, theta, search_start)
     time_constants = np.maximum(theta[count:], 0.0)
     standard_errors = _standard_errors(
         J=J,

@@ -159,6 +159,8 @@ def _blocks(log: Log, folds: int, count: int, past: int, steps: int) -> Folds | 
     length = len(log) / count
     between = int((folds - 1) * length)  # rows between two blocks of a fold
     without_overlap = window  # no row of a held-out window is trained on
+    # Of short blocks little would be left to train on: there the past of a held-out
+    # window has training rows, and its end is near to them; that is accepted.
     affordable = int(length / _GAP_SHARE)
     leaves_a_window = (between - window - 1) // 2  # with a gap on both sides of it
     gap = min(without_overlap, affordable, leaves_a_window)

@@ -29,7 +29,7 @@ from gpmpc.logs._comparison import (
     independent_predictions,
     predictions_of_pieces,
 )
-from gpmpc.logs._fitting import PAST
+from gpmpc.logs._fitting import PAST, rows_before
 from gpmpc.logs._learning import IdentifiedModel, fewest_rows
 from gpmpc.logs._log import Log
 from gpmpc.logs._noise import (
@@ -191,7 +191,7 @@ def judge(
     parts = [
         _judge_windows(learned, train, windows, own_steps, names, longest=max(steps))
         for windows, own_steps in held_out.windows_by_step(
-            steps, _past_rows(learned), most=_WINDOWS
+            steps, rows_before(learned.model), most=_WINDOWS
         )
     ]
     return _joined(parts)
@@ -352,7 +352,7 @@ def most_steps(learned: IdentifiedModel, held_out: Log, train: Log) -> int:
     from.
     """
     # A window has the past, the start and the steps.
-    judged = held_out.longest_piece - _past_rows(learned) - 1
+    judged = held_out.longest_piece - rows_before(learned.model) - 1
     fitted = train.longest_piece - PAST - 1
     return min(judged, fitted)
 
@@ -363,7 +363,7 @@ def most_told_steps(learned: IdentifiedModel, held_out: Log) -> int:
     So many that four predictions do not overlap; less than one for none.
     """
     pieces = [end - begin for run in held_out for begin, end in run.pieces]
-    rows = np.array(pieces) - _past_rows(learned)
+    rows = np.array(pieces) - rows_before(learned.model)
 
     def too_few(steps: int) -> bool:
         starts = rows[rows > steps] - steps
@@ -377,7 +377,7 @@ def short_pieces(
     learned: IdentifiedModel, judgement: Judgement, held_out: Log, train: Log
 ) -> tuple[str, ...]:
     """Returns sentences on the rows in pieces too short for the longest rollouts."""
-    past = _past_rows(learned)
+    past = rows_before(learned.model)
     sentences = []
     steps = judgement.steps[-1]
     share = 1 - held_out.share_in_pieces(past + steps + 1)
@@ -396,16 +396,11 @@ def short_pieces(
     return tuple(sentences)
 
 
-def _past_rows(learned: IdentifiedModel) -> int:
-    """Returns the rows before a start that a model and the baselines look back on."""
-    return max(learned.model.past, PAST)
-
-
 def check_learned(learned: IdentifiedModel, held_out: Log, train: Log) -> None:
     """Raises ``DataError`` of a log that is too short to judge a model on."""
     if most_steps(learned, held_out, train) >= 1:
         return
-    looks_back = _past_rows(learned)
+    looks_back = rows_before(learned.model)
     names = ", ".join(run.name for run in held_out)
     raise DataError(
         f"{names}: the model looks back on {looks_back} rows, so judging it needs "

@@ -136,6 +136,7 @@ class _RolloutErrors:
         longest = max(b - a for run in log for a, b in run.pieces) - model.past - 1
         steps = min(steps, longest)
         if model.weights.size <= _FEW_WEIGHTS:
+            # Half of a piece, which has as many starts then as a rollout has steps.
             affordable = min(len(log) // _ROWS_A_STEP, longest // 2)
             steps = int(np.clip(affordable, steps, _STRETCH * steps))
         count = _ROLLED_ROWS // (model.weights.size * steps)
@@ -198,7 +199,9 @@ def choose_penalties(model: LogModel, log: Log, steps: int) -> Array:
     """
     o = len(model.history)
     try:
-        trials = [_Trial.of(model, *pair, steps) for pair in _halves(log, model.past)]
+        trials = [
+            _Trial.of(model, *pair, steps) for pair in _left_out_halves(log, model.past)
+        ]
     except DataError:  # too short to be divided
         return np.full(o, _FIRST_PENALTY)
     penalties = _best(trials, [np.full(o, penalty) for penalty in PENALTIES])
@@ -279,7 +282,10 @@ def _moments(model: LogModel, log: Log) -> Moments:
 
 
 def _as_window(log: Log, run: LogRun, begin: int, end: int) -> Windows:
-    """Returns a piece of a run as one window, whose start is its last row but one."""
+    """Returns a piece of a run as one window, whose start is its last row but one.
+
+    Of all rows up to the start it is known what they led to: each has a target.
+    """
     rows = slice(begin, end)
     return Windows(
         space=log.space,
@@ -325,7 +331,7 @@ def regression_data(model: LogModel, windows: Windows) -> tuple[Array, Array]:
     return model.memory.regressors(features, remembered), residuals
 
 
-def _halves(log: Log, past_rows: int) -> list[tuple[Log, Log]]:
+def _left_out_halves(log: Log, past_rows: int) -> list[tuple[Log, Log]]:
     """Splits a log in two halves, each of which is left out once.
 
     By run where there are enough runs, else by blocks of time that alternate. What a

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.optimize import lsq_linear, nnls
 
 from gpmpc._dynamics import Array
-from gpmpc.logs._fitting import PAST
+from gpmpc.logs._fitting import rows_before
 from gpmpc.logs._log import Log
 from gpmpc.logs._ranges import difference_steps, widths_of
 from gpmpc.models._kinematics import Kinematics
@@ -388,7 +388,7 @@ def learning_gains(
     ratios = []
     for few, model, log in zip(fewer, models, logs, strict=True):
         windows = log.windows(
-            max(steps), past=max(few.past, model.past, PAST), most=_COMPARED
+            max(steps), past=max(map(rows_before, (few, model))), most=_COMPARED
         )
         squared = [
             np.square(one.rollout_errors(windows, steps)).mean(axis=0)
@@ -448,7 +448,7 @@ def _fold_errors(
         most: Number of windows, about.
         linearized: Number of windows along which rollouts are linearised, about.
     """
-    windows = log.windows(max(steps), past=max(model.past, PAST), most=most)
+    windows = log.windows(max(steps), past=rows_before(model), most=most)
     stride = -(-len(windows) // linearized)
     measured, modelled = model.first_outputs(windows)
     squared = np.square(model.rollout_errors(windows, steps))

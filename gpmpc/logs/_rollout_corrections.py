@@ -7,9 +7,9 @@ comes first, then, one by one, that with which the mean is best (Caruana et al.,
 Ensemble selection from libraries of models).
 
 Regressions that keep nothing of a rollout need none. They are fitted to windows of all
-rows, at each step to all that reach so far, and not to those of held-out blocks, which
-end where a block ends: of short blocks these are half of all, and what is fitted to
-them loses to the baseline.
+rows, at each step to all that reach so far. Windows of held-out blocks end where their
+block ends: of short blocks that leaves half of all windows, and what is fitted to those
+loses to the baseline.
 
 What is best is told stretch by stretch: a run, or a part of one where there are few. On
 each, errors are taken over those of what costs nothing, the ridge regression or a

@@ -177,10 +177,10 @@ class Search:
     def score(self, structure: Structure) -> float:
         """Returns the score of a structure that was considered; smaller is better."""
         bonus = _CORRECTION_BONUS if structure.correction_shares else 0.0
-        return self._logarithm(structure) + _PIECE * structure.size - bonus
+        return self._score_without_pieces(structure) + _PIECE * structure.size - bonus
 
-    def _logarithm(self, structure: Structure) -> float:
-        """Computes the score without what a structure's pieces cost."""
+    def _score_without_pieces(self, structure: Structure) -> float:
+        """Computes the score without what pieces cost; what is unstable is behind."""
         logarithms = self._held_out.logarithms(self._errors[structure.key])
         simulated = self._simulated[structure.uncorrected.key]
         if len(simulated):
@@ -550,7 +550,7 @@ class Search:
         """Enters a candidate with its errors."""
         self._structures[structure.key] = structure
         self._errors[structure.key] = errors
-        relative = np.exp(self._logarithm(structure))
+        relative = np.exp(self._score_without_pieces(structure))
         best = " (best so far)" if self.best is structure else ""
         self._progress(
             f"{structure.name}: {relative:.3f} of the best baselines' errors{best}"

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gpmpc.exceptions import DataError
-from gpmpc.logs._fitting import PAST, NominalFit
+from gpmpc.logs._fitting import PAST, NominalFit, rows_before
 from gpmpc.logs._folds import MANY_RUNS, Fold
 from gpmpc.logs._log import Log, LogRun
 from gpmpc.logs._noise import as_flown, fit_noise, learning_gains, noise_steps
@@ -157,9 +157,9 @@ class Validations:
             models.append(model)
         held_out = [validation.held_out for validation in validations]
         steps = noise_steps(self._steps)
-        has_halves = len(validations) > len(self._folds)
+        has_quarters = len(validations) > len(self._folds)
         # Of many runs, how unlike they are decides, not how many rows they have.
-        if not has_halves or len(self._log.runs) >= MANY_RUNS:
+        if not has_quarters or len(self._log.runs) >= MANY_RUNS:
             return fit_noise(models, held_out, steps)
         of_halves = self.corrected_models(structure)
         fewer = [of_halves[validation.fold] for validation in validations]
@@ -268,7 +268,7 @@ class Validations:
         fraction = len(held_out) / len(self._log)
         windows = held_out.windows(
             ahead=self._steps,
-            past=max(model.past, PAST),
+            past=rows_before(model),
             most=max(round(fraction * _CORRECTED_WINDOWS), 1),
         )
         with np.errstate(over="ignore", invalid="ignore"):
@@ -340,7 +340,7 @@ def _unseen(rows: Fold, model: LogModel) -> Fold:
     Held-out blocks begin with the past that the most demanding structure needs, which
     may be rows of the training. A model that looks back on fewer would predict some.
     """
-    past = max(model.past, PAST)
+    past = rows_before(model)
     runs = [
         _without_first(run, rows.train.runs, kept=past + 1) for run in rows.held_out
     ]
