@@ -23,7 +23,9 @@ from gpmpc.trajectories import Elliptical
 PLANT = translational()
 PENDULUM = pendulum()
 ROLLOUT = object()
-MODEL = SimpleNamespace(name="model", state_dim=6)
+MODEL = SimpleNamespace(
+    name="model", state_dim=6, output_dim=6, input_dim=2, predict=None
+)
 STEP = object()
 
 
@@ -117,9 +119,12 @@ def test_a_controller_that_knows_the_plant_is_made_of_it(loops):
     assert loops[1][0][1].made_of is PLANT
 
 
-@pytest.mark.parametrize("propagator", [None, "mine"])
+@pytest.mark.parametrize("propagator", [None, SimpleNamespace(propagate=None)])
 def test_a_model_loop_is_flown_in_the_models_own_world(propagator, loops, monkeypatch):
-    monkeypatch.setattr(_trial, "best_propagator", lambda model: ("best for", model))
+    def best(model):
+        return SimpleNamespace(propagate=None, best_for=model)
+
+    monkeypatch.setattr(_trial, "best_propagator", best)
     run_trial(
         experiment(
             loop="model", propagator=propagator, system=translational(time_step=0.25)
@@ -128,7 +133,7 @@ def test_a_model_loop_is_flown_in_the_models_own_world(propagator, loops, monkey
     (system, *_), _ = loops[1]
     assert isinstance(system, ModelLoop)
     assert system.model is MODEL
-    assert system.propagator == (propagator or ("best for", MODEL))
+    assert system.propagator == (propagator or best(MODEL))
     assert system.time_step == 0.25
 
 
