@@ -240,6 +240,8 @@ class FlightJudge:
                 violation = float(decision.violation)
         if self._plans_hold_more:
             n = self._no_means.shape[1]
+            if measured.ndim == 1:  # a model loop shows pending inputs, too
+                measured = measured[:n]
             references = _float64(references[..., :n])
             means = _float64(means[..., :n])
             covariances = _float64(covariances[..., :n, :n])
