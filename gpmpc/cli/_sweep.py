@@ -96,6 +96,7 @@ class Sweep:
         #: folders of finished runs that are none of this sweep: another process wrote
         #: a damaged result, or flew other settings
         self.unusable: set[Path] = set()
+        self._compared: set[Path] = set()  # folders of runs that have the settings
         self._remarks: set[str] = set()  # that were printed, without their numbers
 
     def close(self) -> None:
@@ -143,7 +144,12 @@ class Sweep:
             self._chunking.measure(job)
 
     def _check_finished(self, job: Job) -> None:
-        """Compares a run's settings, once: the index says with what it was compared."""
+        """Compares a run's settings, once: the index says with what it was compared.
+
+        Raises:
+            SettingError: The run has other settings.
+            DataError: Its result is damaged.
+        """
         fingerprint = job.settings.fingerprint()
         path = job.folder.path / METRICS
         record = None
@@ -158,6 +164,7 @@ class Sweep:
             warning = warning_of(result)
             other_code = of_other_code(result)
             self._add_to_index(path, result, fingerprint)
+        self._compared.add(job.folder.path)
         if warning:
             self.warnings[job.folder.path] = warning
         if other_code:
@@ -188,7 +195,14 @@ class Sweep:
             on_settled=settle,
             retries=self.config.retries,
         )
-        flying.fly(job.with_absolute_path() for job in jobs if not job.folder.finished)
+        to_fly = []
+        for job in jobs:
+            if not job.folder.finished:
+                to_fly.append(job.with_absolute_path())
+            elif job.folder.path not in self._compared:
+                # Another process has finished it since ``check``.
+                outcomes.append(self._outcome(job, RunState.FINISHED))
+        flying.fly(to_fly)
         self.flown_again |= {*flying.flown_again_from_before, *flying.flown_again_now}
         self.out_of_retries |= flying.out_of_retries
         return outcomes

@@ -6,6 +6,7 @@ import logging
 import os
 import re
 import threading
+from contextlib import suppress
 from types import SimpleNamespace
 
 import hydra
@@ -17,6 +18,7 @@ from gpmpc.cli._chunks import Chunk, Chunking, Job, fly_chunk
 from gpmpc.cli._composing import Composer
 from gpmpc.cli._examples import Examples
 from gpmpc.cli._overrides import choices, combinations
+from gpmpc.cli._run import RunToFly
 from gpmpc.cli._settings import model_file, settings_folders
 from gpmpc.cli._sweep import JobOutcome, Sweep, _end_of, _EndCounter
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
@@ -287,8 +289,9 @@ def test_a_model_s_file_is_known_by_its_ending():
         assert model_file(f"model={name}") == ["model=saved", f"model.path={name}"]
 
 
+@pytest.mark.parametrize("is_late", [True, False])
 def test_a_run_that_another_process_flew_with_other_settings_has_failed(
-    tmp_path, monkeypatch
+    is_late, tmp_path, monkeypatch
 ):
     """Also where settings ask for what no text of theirs tells."""
     monkeypatch.setenv("GAIN", "0.5")
@@ -304,6 +307,9 @@ def test_a_run_that_another_process_flew_with_other_settings_has_failed(
     runs = Sweep("run", words, Console(quiet=True))
     job = runs.job(words)
     assert job.settings.fingerprint() is None
+    if not is_late:  # but behind the check
+        with suppress(Busy):
+            flight(RunToFly({}, {}, job.choices, "gpmpc run", job.folder))
     (outcome,) = runs.fly([job])
     assert "holds a finished run of other settings" in outcome.error
     end = _end_of([job], [outcome], finished_before=set(), unusable=runs.unusable)
