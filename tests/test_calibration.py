@@ -309,7 +309,7 @@ def test_round_off_ends_no_run():
 
 
 @pytest.mark.parametrize("delays", [(1.0, 1.0), (1.5,)])
-def test_delays_around_gps_in_float32_are_calibrated_as_in_float64(delays):
+def test_delays_in_float32_are_calibrated_as_in_float64(delays):
     widths = []
     for dtype in (torch.float32, torch.float64):
         model = value_model(2, 1, 2, predicts="difference").to(dtype=dtype)

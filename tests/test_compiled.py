@@ -254,7 +254,7 @@ def test_numba_still_has_the_private_parts_that_are_used_here():
     )
 
 
-def test_a_callee_is_compiled_once_and_no_garbage_collected_meanwhile():
+def test_a_callee_is_compiled_once_without_collecting_garbage():
     """Once for kernels that keep the interpreter's lock and for those that do not."""
     from numba.core import event
 

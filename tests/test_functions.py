@@ -180,7 +180,7 @@ def test_measurements_get_the_rule_and_the_name():
         lambda x: torch.cat([x[..., :1], x[..., 1:].sqrt().detach()], dim=-1),
     ],
 )
-def test_a_function_that_loses_a_part_of_its_derivative_is_refused(lost):
+def test_a_function_of_a_lost_derivative_is_refused(lost):
     lost_in_part = "function: must be followed by torch as a whole: .* torch finds"
     with pytest.raises(SettingError, match=lost_in_part):
         KnownModel(lambda x, u: lost(x) + u, 2, 1)

@@ -86,7 +86,7 @@ def test_the_loops_of_the_guides_reach_their_goals(path, page):
     assert abs(names.get("away", 0.5) - 0.5) < 0.02
 
 
-def test_a_boat_crosses_behind_a_ferry_that_is_told_anew_each_step(page):
+def test_a_boat_crosses_behind_a_ferry_told_anew_each_step(page):
     names, _ = page("docs/guide_together.md")
     assert names["reached"] < 0.1
     assert 0.97 < names["nearest"] < 1.1

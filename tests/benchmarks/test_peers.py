@@ -107,9 +107,7 @@ def optimum(gp, instances):
     return plan.reshape(H, 3) * [1.0, 0.1, 0.1]
 
 
-def test_the_residual_vanishes_at_an_optimum_found_otherwise_and_nowhere_near_it(
-    gp, instances, optimum
-):
+def test_the_residual_vanishes_at_an_optimum_alone(gp, instances, optimum):
     at_bounds = (optimum == PROBLEM.inputs.lower) | (optimum == PROBLEM.inputs.upper)
     assert at_bounds.any()
     assert not at_bounds.all()
@@ -126,9 +124,7 @@ def test_the_residual_vanishes_at_an_optimum_found_otherwise_and_nowhere_near_it
     assert kkt_residual(gp, PROBLEM, instances[0], np.full((H, 3), np.nan)) == np.inf
 
 
-def test_a_plan_beyond_its_bounds_is_no_optimum_even_where_the_slope_is_zero(
-    gp, instances
-):
+def test_a_plan_beyond_its_bounds_is_never_an_optimum(gp, instances):
     free = Problem(Tracking(PROBLEM.cost.Q, PROBLEM.cost.R))
     answer = converged(gp, free, H)[OWN]()(instances[0], None)
     assert (
@@ -218,9 +214,7 @@ def test_a_run_forgets_its_solution_at_the_end_or_when_cold(cold, instances):
     assert run.plans == [(0, 1), (1, 2), (0, 3)]
 
 
-def test_the_table_of_peers_has_a_row_for_everybody_and_says_who_is_missing(
-    gp, instances
-):
+def test_the_table_of_peers_says_who_is_missing(gp, instances):
     cases = converged(gp, PROBLEM, H) | {"absent": None}
     cases = {
         name: cases[name] for name in (OWN, "CasADi, IPOPT, Gauss-Newton", "absent")

@@ -59,9 +59,7 @@ def true_model(robot):
 
 
 @pytest.mark.parametrize(("robot", "joint"), [("acrobot", 1), ("pendubot", 0)])
-def test_a_controller_in_the_leagues_interface_plans_at_50_hz_and_drives_one_joint(
-    robot, joint
-):
+def test_the_leagues_controller_plans_at_50_hz_for_one_joint(robot, joint):
     who = pilot(true_model(robot), robot, horizon=25, programs=3, wild=False)
     controller = league_controller(Interface, who)
     rhs = right_hand_side()
@@ -106,7 +104,7 @@ def test_hanging_is_below_and_upright_above_the_line():
     assert heights(np.array([hanging, upright])) == pytest.approx([-0.5, 0.5])
 
 
-def test_every_parameter_of_the_wrong_body_is_wrong_by_the_share_and_seeds_differ():
+def test_all_parameters_of_the_wrong_body_are_off_by_the_share():
     true = double_pendulum("elbow").dynamics
     bodies = [wrong_system("acrobot", 0.15, seed).dynamics for seed in (0, 1)]
     for body in bodies:
@@ -116,7 +114,7 @@ def test_every_parameter_of_the_wrong_body_is_wrong_by_the_share_and_seeds_diffe
     assert bodies[0] != bodies[1]
 
 
-def test_learned_from_are_calm_transitions_without_a_torque_on_the_passive_joint():
+def test_calm_transitions_without_passive_torque_are_learned():
     states = np.zeros((101, 4))
     torques = np.zeros((100, 2))
     torques[:, 1] = np.repeat([1.0, 2.5], 50)
@@ -148,7 +146,7 @@ def test_a_body_fitted_to_five_seconds_predicts_as_the_true_one(
     assert error < 2 * least < 0.01 * wrong_error
 
 
-def test_a_residual_learned_from_random_torques_predicts_better_than_the_wrong_body():
+def test_a_residual_of_random_torques_beats_the_wrong_body():
     nominal = casadi_model(wrong_system("pendubot", 0.15, 3))
     data = transitions(random_record("pendubot", 5.0, 0), "pendubot")
     test = transitions(random_record("pendubot", 5.0, 1), "pendubot")
@@ -162,7 +160,7 @@ def test_a_residual_learned_from_random_torques_predicts_better_than_the_wrong_b
     assert errors[0] < 0.3 * errors[1]
 
 
-def test_the_board_is_sorted_and_says_what_share_of_draws_is_above_the_best():
+def test_the_board_is_sorted_and_has_shares_above_the_best():
     rows = [
         {
             "model": "gp",
@@ -186,9 +184,7 @@ def test_the_board_is_sorted_and_says_what_share_of_draws_is_above_the_best():
     ]
 
 
-def test_what_was_learned_is_kept_in_a_file_and_not_learned_again_by_the_same_code(
-    monkeypatch, tmp_path
-):
+def test_what_was_learned_is_not_learned_again_by_the_same_code(monkeypatch, tmp_path):
     data = transitions(random_record("acrobot", 5.0, 0), "acrobot")
     learned = []
 
@@ -286,7 +282,7 @@ def test_draws_that_were_played_are_read_and_not_played_again(monkeypatch, tmp_p
     assert again[0]["version"]
 
 
-def test_draws_of_other_code_are_played_again_and_stay_in_their_file(
+def test_draws_of_other_code_are_played_again_beside_them(
     monkeypatch, tmp_path, capsys
 ):
     scores = iter((0.1, 0.2, 0.3))

@@ -76,9 +76,7 @@ def timed_pilot(monkeypatch, start, decision, value=0.1):
 
 
 @pytest.mark.parametrize(("start", "begins"), [(0.01, 30), (0.05, 30), (0.07, None)])
-def test_a_plan_acts_after_the_time_that_its_search_has_and_never_if_that_is_too_short(
-    start, begins, monkeypatch
-):
+def test_a_plan_acts_after_its_search_and_never_if_late(start, begins, monkeypatch):
     who = timed_pilot(monkeypatch, start, 0.001)
     torques = [
         who.torques(np.array([np.pi + 0.1, 0.0, 0.0, 0.0]), INPUT * k)[0]
@@ -97,7 +95,7 @@ def test_a_plan_acts_after_the_time_that_its_search_has_and_never_if_that_is_too
     ] == pytest.approx(-0.6)
 
 
-def test_a_late_decision_leaves_the_last_plan_flying_until_it_is_known(monkeypatch):
+def test_the_last_plan_flies_until_a_late_decision_is_known(monkeypatch):
     # 15 inputs
     who = timed_pilot(monkeypatch, 0.01, 0.029)
     decided = []
@@ -125,7 +123,7 @@ def test_all_starts_are_taken_until_there_is_a_good_plan(value, searches, monkey
     assert (len(who.seconds) > 0) == np.any(torques) == (value < 5)
 
 
-def test_rates_are_found_from_angles_whatever_the_noise_of_the_rates():
+def test_rates_are_found_from_angles_under_any_noise_of_rates():
     record = random_record("acrobot", 2.0, 0)[0]
     states = np.array([state_of(x) for x in record.states])
     rates = np.random.default_rng(0).normal(0, 0.5, (len(states), 2))
@@ -158,7 +156,7 @@ def test_delay_and_responsiveness_are_found_from_probes(robot, delay, response):
     assert who.response == pytest.approx(response, abs=0.05 if response < 1 else 0.25)
 
 
-def test_a_pilot_is_shown_the_state_of_now_where_measurements_are_late():
+def test_a_pilot_is_shown_the_present_state_of_late_sensors():
     shown = []
 
     def torques(x, t):

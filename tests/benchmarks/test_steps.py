@@ -45,7 +45,7 @@ def test_springs_pull_neighbours_together():
     assert rates[3] == pytest.approx(-4 * np.sin(0.5) - 1.0)
 
 
-def test_every_cell_has_a_row_for_everything_that_is_compared_and_all_are_shown():
+def test_every_cell_shows_all_that_is_compared():
     rows = [
         row | {"cache": "hot"}
         for N in (5, 8)

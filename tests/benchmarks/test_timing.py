@@ -38,7 +38,7 @@ def test_cases_alternate():
     }
 
 
-def test_a_turn_is_several_calls_of_which_the_first_is_told_from_the_others():
+def test_the_first_call_of_a_turn_is_told_from_the_others():
     order = []
     cases = {"a": lambda: order.append("a"), "b": lambda: order.append("b")}
     times = time_interleaved(cases, 1e-9, min_rounds=2, in_a_row=3)
@@ -84,9 +84,7 @@ def test_no_time_and_no_rounds_are_refused(setting):
         time_interleaved({}, **setting)
 
 
-def test_results_are_written_with_what_made_them_and_shown_as_a_table(
-    tmp_path, monkeypatch
-):
+def test_results_are_written_with_their_origin_and_as_a_table(tmp_path, monkeypatch):
     monkeypatch.setattr(timing, "RESULTS", tmp_path / "new")
     rows = [{"what": "a", "median": 1.23456}, {"what": "bc", "median": 789.0}]
     found = json.loads(write_results("x", rows, machine=machine()).read_text())

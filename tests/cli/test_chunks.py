@@ -290,7 +290,7 @@ def test_a_model_s_file_is_known_by_its_ending():
 
 
 @pytest.mark.parametrize("is_late", [True, False])
-def test_a_run_that_another_process_flew_with_other_settings_has_failed(
+def test_a_run_flown_elsewhere_with_other_settings_has_failed(
     is_late, tmp_path, monkeypatch
 ):
     """Also where settings ask for what no text of theirs tells."""

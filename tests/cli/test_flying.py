@@ -65,9 +65,7 @@ def begins_again(chunk):
         chunk.folders[0].begin("act: 1\n")
 
 
-def test_a_chunk_that_is_said_to_be_done_and_is_not_there_has_failed(
-    tmp_path, monkeypatch
-):
+def test_a_chunk_said_to_be_done_but_not_there_has_failed(tmp_path, monkeypatch):
     monkeypatch.setattr(_flying, "_LATE", 0.0)
     jobs = jobs_of(tmp_path, "flies", "flies", "flies")
     launcher = Told(tmp_path, {}, {"host": "blind (10.0.0.7)"})
@@ -128,7 +126,7 @@ def test_a_limit_fails_the_run_that_reached_it_alone(cause, tmp_path):
 
 
 @pytest.mark.parametrize("cause", [Cause.CANCELLED, Cause.ERROR])
-def test_what_concerns_a_whole_chunk_fails_all_that_is_left_of_it(cause, tmp_path):
+def test_a_failure_of_a_chunk_fails_all_that_is_left_of_it(cause, tmp_path):
     jobs = jobs_of(tmp_path, "flies", "flies", "flies", "flies")
     fly(Chunk((jobs[0],)))
     _, states = flown(Told(tmp_path, {"cause": cause, "reason": "no"}), jobs, size=2)
@@ -147,7 +145,7 @@ def test_what_concerns_a_whole_chunk_fails_all_that_is_left_of_it(cause, tmp_pat
 
 
 @pytest.mark.parametrize("cause", [Cause.NODE, Cause.CRASH])
-def test_a_run_whose_process_dies_flies_again_as_often_as_allowed(cause, tmp_path):
+def test_a_run_whose_process_dies_is_flown_again(cause, tmp_path):
     jobs = jobs_of(tmp_path, "flies", "flies")
 
     def dies():
@@ -176,7 +174,7 @@ def test_a_run_whose_process_dies_flies_again_as_often_as_allowed(cause, tmp_pat
     assert flying.flown_again_from_before == [str(jobs[0].folder.path)]
 
 
-def test_a_chunk_whose_process_began_nothing_counts_for_all_of_it(tmp_path):
+def test_a_process_that_began_nothing_fails_its_whole_chunk(tmp_path):
     jobs = jobs_of(tmp_path, "flies", "flies")
     end = {"cause": Cause.CRASH, "reason": "gone"}
     _, states = flown(Told(tmp_path, end), jobs, size=2, retries=0)

@@ -152,9 +152,7 @@ def test_a_recording_tells_how_many_points_a_saved_model_has(tmp_path):
     assert recorded.gp_sizes.tolist() == [7]
 
 
-def test_names_that_no_recording_takes_are_refused_before_a_training(
-    tmp_path, monkeypatch
-):
+def test_names_no_recording_takes_are_refused_before_training(tmp_path, monkeypatch):
     class Leg:
         state_names = ("left/hip",)
         input_names = ("torque",)

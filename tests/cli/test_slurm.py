@@ -258,7 +258,7 @@ def test_a_job_flies_its_chunk_and_says_so(fake, tree):
     assert job.folder.finished
 
 
-def test_the_jobs_of_a_killed_sweep_are_watched_and_not_flown_twice(fake, tree):
+def test_jobs_of_a_killed_sweep_are_not_flown_twice(fake, tree):
     jobs = jobs_of(tree, "flies", "flies", "flies")
     killed = Slurm(tree, timeout_min=5)
     killed.launch(fly, in_chunks(1)(jobs[:2]))

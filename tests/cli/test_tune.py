@@ -239,7 +239,7 @@ def test_a_flight_of_which_steps_are_lost_has_no_cost(tmp_path):
         _cost(SimpleNamespace(folder=folder), controller)
 
 
-def test_entries_of_a_list_are_set_in_the_list_of_the_candidate_s_system():
+def test_entries_of_a_list_are_set_in_the_candidates_system():
     Q = "controller.problem.cost.Q"
     with settings_folders():
         runs = Sweep("tune", ["system=cart_pole"], Console(quiet=True))

@@ -173,7 +173,7 @@ def test_a_state_that_is_not_measured_hides_no_bound_on_another():
 
 
 @pytest.mark.parametrize("unmeasured", [np.nan, np.inf, 3.4e38])
-def test_an_angle_goes_on_without_jumps_beside_what_is_not_measured(unmeasured):
+def test_an_angle_has_no_jumps_beside_what_is_not_measured(unmeasured):
     scores = np.linspace(0.1, 3, 100)[:, None]
     both_sides = [[1.0, 0.0], [-1.0, 0.0]]
     tube = AdaptiveTube(ConformalTube(scores, both_sides, angles=[0]), 0.9)

@@ -88,7 +88,7 @@ def test_no_delay_is_tried_that_is_longer_than_the_longest():
     assert delays[-1] == 3.0
 
 
-def test_a_delay_that_may_be_longer_than_the_longest_is_said_in_the_log(caplog):
+def test_a_delay_at_the_longest_tried_is_said_in_the_log(caplog):
     states, inputs = log(300, 3, 0)
     estimate_delay(states, inputs, longest=4)
     assert not caplog.messages
@@ -224,7 +224,7 @@ def test_rows_that_were_trained_on_count_as_if_they_had_not_been():
     assert (estimate_process_noise(model, data).variance > in_sample).all()
 
 
-def test_rows_between_those_that_were_trained_on_are_left_out_with_them():
+def test_rows_between_training_rows_are_left_out_with_them():
     data = transitions(*log(200, 0, 3, std=(2e-3, 0.03)))
     gp = Trainer(predicts="difference", restarts=0)(data[::2]).posterior
     rows = data[:39]  # every second one is one of the first 20 points
@@ -316,7 +316,7 @@ def test_each_row_of_a_plant_at_rest_is_left_out_itself(noise, order):
     assert torch.allclose(variance, expected, rtol=1e-6)
 
 
-def test_a_row_with_the_state_and_input_of_a_point_but_another_target_is_new():
+def test_a_row_of_known_inputs_and_another_target_is_new():
     data = transitions(*log(40, 0, 3, std=(2e-3, 0.03)))
     gp = Trainer(predicts="difference", restarts=0)(data).posterior
     again = Transitions(data.states, data.inputs, data.next_states + 1.0)
@@ -433,7 +433,7 @@ def test_rows_of_a_model_inside_of_others_are_left_out_as_well(delay):
 
 
 @pytest.mark.parametrize("varies", [False, True])
-def test_rows_of_a_residual_whose_effect_varies_are_left_out_as_well(varies):
+def test_rows_of_a_residual_of_varying_effect_are_left_out(varies):
     data = transitions(*log(60, 0, 3, std=(2e-3, 0.03)))
 
     def effect(x):

@@ -163,7 +163,7 @@ def test_a_late_measurement_counts_as_if_it_had_come_in_time():
         late.measure(measured[0], age=5)
 
 
-def test_a_late_filter_keeps_its_own_numbers_and_survives_mistakes():
+def test_a_late_filter_keeps_its_numbers_and_survives_mistakes():
     sensor = Measurement.of_states(2, [0], [0.1])
     filter = KalmanFilter.extended(LINEAR, sensor)
     _, inputs, measured = simulated(LINEAR, 8, 1, sensor)
@@ -426,7 +426,7 @@ def test_a_smoother_keeps_its_digits_under_a_flat_prior():
     assert (torch.linalg.eigvalsh(runs[1].covariance) > 0).all()
 
 
-def test_sigma_points_of_negative_weight_take_no_noise_from_a_sensor():
+def test_negative_weights_take_no_noise_from_a_sensor():
     n = 6
     observer = Unscented(kappa=3.0 - n)
     squares = Measurement(

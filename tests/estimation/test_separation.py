@@ -95,7 +95,7 @@ def test_the_model_predicts_the_same_with_process_noise():
         assert bool((noise < 0.7 * model.noise_covariance.diagonal()).all())
 
 
-def test_after_the_separation_all_that_was_learned_is_still_known():
+def test_a_separation_keeps_all_that_was_learned():
     sensors = np.array([0.01, 0.02])
     gp, rows = learned(0.3 * sensors, sensors, steps=120)
     separated = separate_noise(gp, rows).model
@@ -121,7 +121,7 @@ def test_after_the_separation_all_that_was_learned_is_still_known():
     assert torch.allclose(again.weights, gp.weights, rtol=1e-6)
 
 
-def test_a_separated_noise_reaches_every_form_of_a_residual_model():
+def test_separated_noise_reaches_every_form_of_residual_model():
     sensors = np.array([0.01, 0.02])
     model, rows = learned(0.3 * sensors, sensors, kind="residual", steps=120)
     usual = separate_noise(model, rows)

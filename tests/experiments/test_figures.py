@@ -71,7 +71,7 @@ def finished(tmp_path_factory):
     return folder, gpmpc(*TINY, cwd=folder)
 
 
-def test_one_command_flies_everything_and_writes_tables_and_figures(finished):
+def test_one_command_writes_all_tables_and_figures(finished):
     folder, run = finished
     assert run.returncode == 0, run.stderr
     written = {path.name for path in (folder / "out").iterdir()}
@@ -162,7 +162,7 @@ def test_a_run_goes_on_where_it_stopped(finished):
         ),
     ],
 )
-def test_a_mistake_is_answered_in_one_line_before_anything_is_trained(
+def test_a_mistake_is_answered_in_one_line_before_training(
     tmp_path, arguments, message
 ):
     run = forked("figures", *arguments, cwd=tmp_path)
@@ -231,15 +231,13 @@ def test_lists_of_settings_make_a_row_for_every_combination():
 @pytest.mark.parametrize(
     ("study", "trials"), [("flights", 50), ("horizon", 5), ("confidence", 12)]
 )
-def test_a_study_says_how_many_trials_it_needs_and_the_command_line_has_the_last_word(
-    study, trials
-):
+def test_the_command_line_overrules_a_studys_number_of_trials(study, trials):
     with initialize_config_dir(str(CONF), version_base="1.3"):
         assert compose("figures", [f"study={study}"]).trials == trials
         assert compose("figures", [f"study={study}", "trials=2"]).trials == 2
 
 
-def test_bounds_are_counted_over_all_steps_and_over_those_planned_at_a_bound(tmp_path):
+def test_bounds_are_counted_over_all_and_over_bounded_steps(tmp_path):
     bounded = [
         "study=confidence",
         "steps=20",
@@ -285,9 +283,7 @@ def on_the_authors_data(folder, rows):
     )
 
 
-def test_on_the_authors_data_the_convex_controller_tracks_within_the_printed_bounds(
-    paper_data, tmp_path
-):
+def test_on_the_authors_data_tracking_is_as_printed(paper_data, tmp_path):
     experiment = on_the_authors_data(paper_data, {"ours": OURS, "free": FREE})
     records = [
         {**t.labels, **experiment.run_trial(t)} for t in experiment.trials(tmp_path)
@@ -307,7 +303,7 @@ def test_on_the_authors_data_the_convex_controller_tracks_within_the_printed_bou
         assert found["free", trajectory].total <= free
 
 
-def test_the_nonlinear_controller_starts_from_the_references_own_inputs():
+def test_the_nonlinear_controller_starts_from_reference_inputs():
     """Starts at the reference's inputs.
 
     From the last input held, a nearly flat direction of this GP takes it hundreds of
@@ -336,7 +332,7 @@ def test_the_nonlinear_controller_starts_from_the_references_own_inputs():
     assert np.allclose(decision.inputs, inputs[:1], atol=1e-3)
 
 
-def test_the_page_has_a_table_a_loop_with_a_line_for_every_row_of_the_csv_file(
+def test_the_page_has_a_line_for_every_row_of_the_csv_file(
     finished,
 ):
     folder, _ = finished

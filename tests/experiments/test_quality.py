@@ -46,9 +46,7 @@ def test_nobody_on_the_front_is_dominated_and_everybody_else_is(points):
 
 
 @given(few, st.integers(1, 3))
-def test_where_more_time_has_to_buy_something_every_member_does_and_nobody_else(
-    points, least
-):
+def test_every_member_of_a_front_buys_something_with_its_time(points, least):
     times = [t for t, _ in points]
     costs = [c for _, c in points]
     found = pareto_front(times, costs, least)
@@ -97,7 +95,7 @@ def test_the_words_of_a_family_are_settings_of_a_run(family):
         )
 
 
-def test_every_controller_and_propagation_of_the_settings_is_among_the_contenders():
+def test_all_controllers_and_propagations_are_contenders():
     words = " ".join(family.words for family in FAMILIES)
     for controller in (CONF / "controller").glob("*.yaml"):
         if controller.stem != "compiled":  # it decides as the convex one does
@@ -145,7 +143,7 @@ def rows(tmp_path_factory):
     return {(row["what"], row["H"]): row for row in study.rows(records)}
 
 
-def test_a_flight_gives_rows_of_finite_numbers_in_the_order_of_the_cases(rows):
+def test_a_flight_gives_finite_rows_in_the_order_of_the_cases(rows):
     words = (TRUTH.words, CHEAP.words, "controller=convex")
     assert sorted(rows) == sorted((what, H) for what in words for H in (1, 2))
     for key, row in rows.items():
@@ -159,7 +157,7 @@ def test_a_flight_gives_rows_of_finite_numbers_in_the_order_of_the_cases(rows):
             assert (row["failed"], row["flights"], row["samples"]) == (0, 2, 24)
 
 
-def test_nmpc_on_the_true_model_costs_one_and_is_no_member_of_the_front(rows):
+def test_nmpc_on_the_true_model_is_no_member_of_the_front(rows):
     assert rows[TRUTH.words, 2]["cost"] == pytest.approx(1, abs=1e-12)
     assert not rows[TRUTH.words, 2]["front"]
     assert any(row["front"] for row in rows.values())
@@ -193,7 +191,7 @@ def test_a_setting_out_of_its_range_is_refused(settings, message):
         Quality(**(given | settings))
 
 
-def test_the_figure_names_the_members_of_the_front_and_counts_the_lost(rows):
+def test_the_figure_names_the_front_and_counts_the_lost(rows):
     figure = front_figure(list(rows.values()))
     named = {
         text.get_text()[3:] for legend in figure.legends for text in legend.get_texts()

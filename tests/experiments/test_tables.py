@@ -95,7 +95,7 @@ def test_there_is_one_record_a_draw_with_every_measure(finished):
         assert (record["held_out_coverage_95"] is None) == (record["size"] == 25)
 
 
-def test_draws_have_their_own_seed_and_subset_and_the_full_set_is_its_own_test_set(
+def test_draws_have_their_own_seed_and_subset(
     finished,
 ):
     _, _, records = finished
@@ -113,9 +113,7 @@ def test_draws_have_their_own_seed_and_subset_and_the_full_set_is_its_own_test_s
     )
 
 
-def test_the_same_seed_gives_the_same_numbers_whatever_the_number_of_workers(
-    finished, tmp_path
-):
+def test_a_seed_gives_the_same_numbers_with_any_workers(finished, tmp_path):
     _, _, records = finished
     again = tables(workers=2)
     repeated = run_study(
@@ -128,9 +126,7 @@ def test_the_same_seed_gives_the_same_numbers_whatever_the_number_of_workers(
     assert tables(seed=1).trials()[0].seed != again.trials()[0].seed
 
 
-def test_a_run_goes_on_from_the_finished_fits_and_passes_over_a_torn_line(
-    finished, tmp_path
-):
+def test_a_run_goes_on_from_finished_fits_past_a_torn_line(finished, tmp_path):
     experiment, store, records = finished
     lines = store.path.read_text().splitlines(keepends=True)
     torn = tmp_path / "trials.jsonl"
@@ -150,7 +146,7 @@ def test_a_run_goes_on_from_the_finished_fits_and_passes_over_a_torn_line(
     assert len(TrialStore(torn).records) == len(records)
 
 
-def test_more_draws_reuse_the_first_ones_and_another_model_reuses_none():
+def test_more_draws_reuse_the_first_ones_of_the_same_model():
     few, more = ([fit.fingerprint for fit in tables(draws=d).trials()] for d in (2, 3))
     assert set(few) < set(more)
     assert set(few).isdisjoint(
@@ -172,7 +168,7 @@ def failing(transitions, seed):
     raise TrainingError([2], "no start led anywhere")
 
 
-def test_a_fit_that_fails_is_kept_counted_and_does_not_stop_the_others(tmp_path):
+def test_a_failed_fit_is_counted_and_does_not_stop_the_others(tmp_path):
     experiment = tables(model=failing)
     records = run_study(
         experiment.run_trial,
@@ -221,7 +217,7 @@ def test_a_size_beyond_the_data_is_refused_with_the_data_named():
         tables(sizes=[26]).trials()
 
 
-def test_data_of_other_columns_than_the_subsystem_has_are_refused():
+def test_data_of_other_columns_than_the_subsystems_are_refused():
     class Narrow:
         def transitions(self, *_):
             return Transitions(*[torch.ones(5, 4)] * 3)
@@ -258,7 +254,7 @@ def statistic(low, high, paper):
         (1.4506e0, 2.0, "within"),
     ],
 )
-def test_the_papers_figure_is_placed_to_the_digits_that_it_prints(low, high, position):
+def test_the_papers_figure_is_placed_to_its_printed_digits(low, high, position):
     assert statistic(low, high, "1.45").position == position
 
 
@@ -339,9 +335,7 @@ def test_the_full_rows_are_the_papers_on_the_authors_data(
         assert record[name] == pytest.approx(float(printed), rel=0.05)
 
 
-def test_our_rotational_flight_with_the_authors_yaw_residue_gives_the_papers_row(
-    paper_data, tmp_path
-):
+def test_the_authors_yaw_residue_gives_the_papers_row(paper_data, tmp_path):
     """Why our own rotational rows differ.
 
     The authors' yaw channels are solver residue, ours are at rest.
@@ -380,9 +374,7 @@ def test_our_rotational_flight_with_the_authors_yaw_residue_gives_the_papers_row
 
 
 @pytest.mark.parametrize("subsystem", SUBSYSTEMS)
-def test_the_measures_of_a_fit_are_those_of_its_predictions_in_the_units_of_the_data(
-    finished, subsystem
-):
+def test_measures_of_a_fit_are_in_the_units_of_the_data(finished, subsystem):
     """Works the measures out anew, by torch's own normal distribution."""
     experiment, _, records = finished
     full = next(r for r in records if (r["subsystem"], r["size"]) == (subsystem, 25))

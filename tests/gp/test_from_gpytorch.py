@@ -285,7 +285,7 @@ def test_moment_matching_says_what_other_kernels_allow():
         )
 
 
-def test_a_residual_of_any_kernel_is_rolled_out_and_not_taken_for_a_posterior():
+def test_a_residual_of_any_kernel_is_rolled_out_as_one():
     model = ResidualModel(
         nominal=Affine.identity(2, 1),
         residual=matern_dynamics("value"),

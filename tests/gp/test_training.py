@@ -206,7 +206,7 @@ def test_a_start_that_is_known_is_searched_from_over_all_points():
     assert np.allclose(again.explored[:, 0], first.objective, rtol=1e-6)
 
 
-def test_an_output_that_stands_still_in_the_subset_is_learned_where_it_moves():
+def test_an_output_still_in_the_subset_is_learned_in_motion():
     """As at a contact; the optimum of the subset is noise, and the search stayed."""
     x = np.random.default_rng(0).uniform(-1.0, 1.0, (400, 2))
     y = 20 * np.maximum(0.0, x[:, :1] - 0.97) * (1 + x[:, 1:])
@@ -525,7 +525,7 @@ def test_a_penalty_that_is_no_number_is_no_success():
             train(pendulum(8), penalty=penalty, restarts=1)
 
 
-def test_a_start_behind_a_wall_of_infinite_height_is_a_failed_one(recwarn):
+def test_a_start_behind_an_infinite_wall_has_failed(recwarn):
     wall = SoftLimits(lengthscale_factor=1.01, power=200)
     training = train(pendulum(8), penalty=wall, restarts=1)
     assert (training.objective < 100.0).all()

@@ -183,7 +183,7 @@ def test_a_measurement_in_doubt_is_not_acted_on():
     assert decisions[61].learned.doubt is None
 
 
-def test_a_sensor_that_is_wrong_twice_in_the_same_way_moves_no_plant():
+def test_a_sensor_wrong_twice_alike_moves_no_plant():
     sensor = Sensor()
     sensor.offset[60:62, 0] = 0.5
     errors, _ = flown(OnlineLearning(), lambda random: sensor)
@@ -448,7 +448,7 @@ def test_an_absurd_measurement_ends_no_flight(invalid):
 
 
 @pytest.mark.parametrize(("first", "second"), [(0.0, 0.3), (-0.1, 5.0), (0.1, 5.0)])
-def test_two_wrong_levels_are_bridged_whatever_the_model_knows_there(first, second):
+def test_two_wrong_levels_are_bridged_far_from_the_data_too(first, second):
     """At none the root has no slope, and below no number."""
     random = np.random.default_rng(0)
 

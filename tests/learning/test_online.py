@@ -298,7 +298,7 @@ def test_an_older_change_stays_and_can_go_another_way():
         assert np.array_equal(model.posterior.weights, weights)
 
 
-def test_a_step_is_expected_with_the_noise_of_states_that_no_gp_has():
+def test_a_step_is_expected_with_noise_of_states_without_gps():
     effect = torch.tensor([[0.05], [1.0]])
     gp = ResidualModel.train(
         Affine.identity(2, 1), DATA, effect, trainer=Trainer(restarts=0)

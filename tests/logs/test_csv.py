@@ -123,7 +123,7 @@ def test_marks_of_thousands_are_refused(tmp_path, rows, mark):
         ("t,x [\N{DEGREE SIGN}/s],u\n", "rad/s", "{x} in {unit} (taken as rad/s)"),
     ],
 )
-def test_units_that_the_file_says_and_the_mapping_does_not_are_found(
+def test_units_of_the_file_that_the_mapping_lacks_are_found(
     tmp_path, header, unit, said
 ):
     (tmp_path / "log.csv").write_text(header + TEXT.partition("\n")[2])
@@ -200,9 +200,7 @@ def test_lines_that_are_no_rows_are_counted(tmp_path, text, kind, count):
 
 @pytest.mark.parametrize("time", [{"time": {"step": 0.01}}, {"rate": 100}])
 @pytest.mark.parametrize("every", [100, 1])
-def test_rows_behind_blank_lines_are_pieces_where_rows_are_counted(
-    tmp_path, time, every
-):
+def test_counted_rows_behind_blank_lines_are_pieces(tmp_path, time, every):
     lines = TABLE[["x", "u"]].to_csv(index=False, header=False).splitlines(True)
     blocks = ["".join(lines[k : k + every]) for k in range(0, len(lines), every)]
     (tmp_path / "log.csv").write_text("x,u\n" + "\n".join(blocks))

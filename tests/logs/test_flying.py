@@ -116,7 +116,7 @@ def without_gps(nominal, space):
     return LogDynamics(LogModel(kinematics, nominal, np.empty(0), (0, 0)), 1, 0.05)
 
 
-def test_parts_that_all_stand_still_are_named_and_a_known_system_moves():
+def test_parts_that_stand_still_are_named():
     space = StateSpace((StateGroup("x", ("angle", "rate"), ""),))
     still = AffineNominal(Increments(space), fitted=False)
     parts = GroupedNominal((still, still), ((0,), (1,)), (0, 0))

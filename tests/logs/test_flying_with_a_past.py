@@ -178,7 +178,7 @@ def test_a_loop_of_ones_own_keeps_it_as_well():
     assert pushed < expected
 
 
-def test_a_loop_that_is_told_the_whole_state_judges_what_its_problem_weighs():
+def test_a_loop_judges_the_states_that_its_problem_weighs():
     model = dynamics()
     loop = ControlLoop(controller(model))
     goal = model.at_rest(GOAL, np.zeros(1))

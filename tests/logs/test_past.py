@@ -113,7 +113,7 @@ def test_outputs_alone_are_learned_with_their_past(tmp_path):
     np.testing.assert_allclose(loaded.rollout(windows), model.rollout(windows))
 
 
-def test_gps_are_tried_upon_a_still_state_beside_the_best_structure():
+def test_gps_are_tried_upon_a_still_state_as_well():
     runs = [replace(tanks(seed, 200).runs[0], name=f"{seed}") for seed in range(4)]
     learned = learn(replace(tanks(0), runs=tuple(runs)), points=10, steps=10)
     names = [candidate.name for candidate in learned.candidates]
@@ -133,7 +133,7 @@ def with_memory(log, memory=ROWS):
     )
 
 
-def test_noisy_rows_are_fitted_better_on_rollouts_than_one_step_ahead():
+def test_noisy_rows_are_fitted_better_on_rollouts():
     found = []
     for origin in (0.0, 300.0):  # such as that of kelvin
         train = moved(tanks(0, noise=0.05), origin)
@@ -333,11 +333,11 @@ def test_a_model_is_read_whatever_part_of_it_sees_the_memory(remembers):
         (("angle", "rate"), ("angle", "speed"), None),
     ],
 )
-def test_names_with_prefixes_are_ordered_by_what_tells_them_apart(own, names, order):
+def test_names_with_prefixes_are_told_apart(own, names, order):
     assert order_by_name(own, [names]) == order
 
 
-def test_noise_without_largest_variances_has_none_when_it_is_scaled():
+def test_scaled_noise_has_no_largest_variances_of_its_own():
     noise = OutputNoise(np.ones((4, 2)), np.ones(2), (1, 10), np.ones((2, 2)))
     twice = noise.scaled(np.full((2, 1), 2.0))
     assert (twice.scales == 2.0).all()

@@ -581,7 +581,7 @@ def test_a_quaternion_whose_sign_flips_is_the_same_attitude(tmp_path):
     assert np.abs(np.diff(log.runs[0].states[:, 3:7], axis=0)).max() < 0.1
 
 
-def test_a_wrong_sample_of_an_attitude_is_left_out_and_many_are_refused(tmp_path):
+def test_one_wrong_attitude_is_left_out_and_many_are_refused(tmp_path):
     table = body_table()
     turns = Rotation.from_euler("ZYX", table[["yaw", "pitch", "roll"]])
     table[["qx", "qy", "qz", "qw"]] = turns.as_quat()

@@ -171,7 +171,7 @@ def test_a_published_record_is_inspected_and_read(tmp_path, write):
     assert not [text for text in inspection.warnings if "cannot be learned" in text]
 
 
-def test_runs_that_stand_side_by_side_are_held_out_by_their_names(tmp_path):
+def test_runs_side_by_side_are_held_out_by_their_names(tmp_path):
     path, mapping = matlab(tmp_path)
     log = read_log(path, mapping)
     names = [run.name for run in log]
@@ -211,7 +211,7 @@ def test_columns_by_number_are_called_as_their_signals(tmp_path):
         read_log(path, mapping_of(u=2, y=4))
 
 
-def test_a_rate_of_rows_without_stamps_is_theirs_in_both_commands(tmp_path):
+def test_both_commands_take_the_rate_of_rows_without_stamps(tmp_path):
     record().to_csv(tmp_path / "tank.csv", index=False)
     mapping = mapping_of(time={}, rate=4)
     assert read_log(tmp_path / "tank.csv", mapping).time_step == STEP

@@ -396,7 +396,7 @@ def test_a_correction_keeps_a_share_of_the_movement():
     np.testing.assert_allclose(corrected, expected, atol=1e-6)
 
 
-def test_a_correction_that_keeps_no_movement_is_the_ridge_regression():
+def test_a_correction_without_movement_is_the_ridge_regression():
     log = reactor_log(200)
     windows = log.windows(10, past=20)
     still = np.repeat(windows.states[:, 20:21], 10, axis=1)
@@ -569,7 +569,7 @@ def test_windows_that_overlap_are_one_error():
     np.testing.assert_allclose(errors[1] / errors[0], np.sqrt(10), rtol=1e-3)
 
 
-def test_intervals_of_a_coverage_hold_where_errors_are_alike_for_long():
+def test_coverage_intervals_hold_for_errors_alike_for_long():
     log = log_of(np.zeros((2, 500, 2)), np.zeros((2, 500, 1)))
     windows = log.windows(1)
     rng = np.random.default_rng(0)
@@ -587,7 +587,7 @@ def test_intervals_of_a_coverage_hold_where_errors_are_alike_for_long():
     assert effective_number(white, windows.runs) > 0.8 * len(white)
 
 
-def test_held_out_runs_too_short_for_some_models_are_told_before_learning():
+def test_held_out_runs_that_are_too_short_are_told_first():
     train = log_of(np.zeros((1, 900, 2)), np.zeros((1, 900, 1)))
     for rows, is_told in ((30, True), (200, False)):
         held_out = log_of(np.zeros((1, rows, 2)), np.zeros((1, rows, 1)))
@@ -911,7 +911,7 @@ def test_a_search_ends_where_all_that_is_best_is_unstable(monkeypatch):
 
 
 @pytest.mark.parametrize("rows", [110, 240])
-def test_what_corrections_and_the_noise_are_fitted_to_was_held_out(rows):
+def test_corrections_and_noise_are_fitted_to_held_out_rows(rows):
     search = tiny_search(log := reactor_log(rows))
     start = next(one for one in search._structures.values() if one.size == 0)
     for one in search._validations._validate(start):
@@ -932,7 +932,7 @@ def test_states_of_any_unit_are_corrected(scale):
     assert search._validations.choose_averages(start) is not None
 
 
-def test_a_correction_that_is_the_ridge_regression_alone_is_the_baseline():
+def test_a_correction_by_ridge_alone_is_the_baseline():
     """It is fitted to all windows, and not to those of held-out blocks alone."""
     log = reactor_log(240)
     search = tiny_search(log)

@@ -108,7 +108,7 @@ def fitted_values(log, steps=15):
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_kinematic_bicycle_is_found_whatever_its_steering_means(tmp_path, sign):
+def test_a_kinematic_bicycle_is_found_for_any_kind_of_steering(tmp_path, sign):
     plant = kinematic_bicycle(
         0.02,
         curvature=3,
@@ -141,7 +141,7 @@ def test_steering_without_a_unit_is_one_that_turns_by_its_share(tmp_path):
     assert values["curvature"] == pytest.approx(3 / 5, rel=0.05)
 
 
-def test_lags_and_a_disturbance_are_fitted_beside_named_parameters(tmp_path):
+def test_lags_and_a_disturbance_join_named_parameters(tmp_path):
     plant = kinematic_bicycle(0.02, curvature=3)
     inputs = excitation(400, (0, 0.3), (0.2, 0.5))
     acting, _ = FirstOrderLags.of([0.1, 0.1], 0.02).filter(inputs)
@@ -368,7 +368,7 @@ class Capped(Arm):
 """
 
 
-def test_values_that_a_system_refuses_beyond_a_bound_are_not_tried(arm):
+def test_values_that_a_system_refuses_are_not_tried(arm):
     (arm / "my_robot.py").write_text(ARM + CAPPED)
     length = {"start": 0.95, "low": 0.5, "high": 0.95}
     entry = {"system": "my_robot:Capped", "parameters": {"length": length, "mass": 1}}
@@ -433,7 +433,7 @@ def test_a_system_that_does_not_fit_is_refused(arm, nominal, text):
         bases(log, 40)
 
 
-def test_a_file_names_the_users_code_and_reads_it_only_where_it_is_trusted(arm):
+def test_a_file_reads_the_users_code_only_where_it_is_trusted(arm):
     log = read_log(arm / "log.csv", {**PENDULUM, "nominal": "my_robot:Arm"})
     fit = fit_nominal(bases(log, 40)[0].model, None, log, steps=5)
     noise = OutputNoise(np.ones((4, 2)), np.ones(2))
@@ -510,7 +510,7 @@ def test_a_file_takes_the_states_as_the_fit_did(arm, keys, older):
         ),
     ],
 )
-def test_a_log_in_other_units_flies_what_its_columns_or_keys_name(arm, states, inputs):
+def test_a_log_in_other_units_flies_by_its_columns_or_keys(arm, states, inputs):
     path, _ = saved_start(arm, states, inputs)
     saved = load_flyable(path)
     plant = pendulum()

@@ -337,9 +337,7 @@ def test_rows_that_a_run_lacks_took_time_as_well(tmp_path, time, runs, pieces):
     "name",
     ["t", "time", "Time [s]", "time (us)", "TimeUS", "TIME", "Zeit [min]", "Datum"],
 )
-def test_rows_of_a_rate_are_not_counted_where_a_column_is_called_as_times_are(
-    tmp_path, name
-):
+def test_a_rate_counts_no_rows_beside_a_column_of_times(tmp_path, name):
     table = strange.pendulum(ROWS).rename(columns={"t": name})
     if name == "Datum":  # no name of times, but dates
         table[name] = pandas.to_datetime(BEGIN + table[name], unit="s")
@@ -426,7 +424,7 @@ def test_times_in_texts_are_read(tmp_path, text):
     assert inspect_log(tmp_path / "a.csv").streams["rate [Hz]"][0] == 2
 
 
-def test_another_unit_of_the_time_than_the_mapping_states_is_noted(tmp_path):
+def test_a_unit_of_time_other_than_the_mappings_is_noted(tmp_path):
     rows = [f"{20 * k},{k % 7},{k % 3}\n" for k in range(60)]
     (tmp_path / "a.csv").write_text("t [ms],x,u\n" + "".join(rows))
     log = read_log(
@@ -465,7 +463,7 @@ def test_stamps_of_a_far_year_are_in_another_unit(tmp_path):
         read_log(tmp_path / "a.csv", {"time": "t", **SIGNALS})
 
 
-def test_the_time_step_in_a_column_has_the_unit_that_the_file_says(tmp_path):
+def test_a_time_step_in_a_column_has_the_unit_of_the_file(tmp_path):
     rows = [f"20,{k % 7},{k % 3}\n" for k in range(60)]
     (tmp_path / "a.csv").write_text("Ts,x,u\n[ms],[m],[N]\n" + "".join(rows))
     log = read_log(tmp_path / "a.csv", {"time": {"step": "Ts"}, **SIGNALS})
@@ -473,7 +471,7 @@ def test_the_time_step_in_a_column_has_the_unit_that_the_file_says(tmp_path):
 
 
 @pytest.mark.parametrize("rate", [60, 120, 240, 400])
-def test_the_step_of_stamps_that_are_rounded_to_ms_is_that_of_the_clock(tmp_path, rate):
+def test_stamps_rounded_to_ms_have_the_step_of_the_clock(tmp_path, rate):
     table = strange.pendulum(ROWS)
     table["t"] = np.round(np.arange(ROWS) / rate, 3)
     table.to_csv(tmp_path / "arm.csv", index=False)

@@ -184,7 +184,7 @@ def test_misuse_is_refused(make, error, rule):
 NAMED = replace(gp(), signals=Signals(["angle", "rate"], ["torque"], 0.1))
 
 
-def test_what_is_measured_of_a_delayed_model_has_the_names_of_its_model():
+def test_measurements_of_a_delayed_model_have_its_names():
     delayed = DelayedModel(NAMED, 1)
     assert delayed.signals.state_names == ("angle", "rate", "torque[k-1]")
     states = 0.1 * draw(5, 9, 2)
@@ -228,7 +228,7 @@ def test_a_noisy_model_has_the_past_of_its_model():
     np.testing.assert_array_equal(*whole)
 
 
-def test_a_model_around_one_that_names_what_is_measured_adds_no_names():
+def test_a_model_around_a_named_one_adds_no_names():
     class Remembering:  # its state goes on with what has no name
         state_dim = output_dim = 3
         measured_dim = 2
@@ -272,7 +272,7 @@ def test_a_model_inside_is_trained_on_the_inputs_that_acted(delay):
         DelayedModel.transitions(table[:2], inputs[:1], delay)
 
 
-def test_a_tube_of_a_delayed_model_is_calibrated_on_what_is_measured():
+def test_a_delayed_models_tube_is_calibrated_on_measurements():
     delayed = DelayedModel(NAMED, 1)
     states = 0.1 * draw(5, 41, 2)
     inputs = draw(6, 40, 1)

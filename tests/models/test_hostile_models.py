@@ -346,7 +346,7 @@ def test_a_log_model_that_does_not_fit_together_is_refused(tmp_path):
             load_learned(path)
 
 
-def test_outputs_without_a_nominal_model_need_no_memory_in_a_file(tmp_path):
+def test_outputs_without_a_nominal_model_need_no_memory(tmp_path):
     from gpmpc.logs import save_learned
     from tests.models.hostile import of_a_pendulum_log
 

@@ -276,7 +276,7 @@ def test_inputs_that_lead_out_of_the_numbers_are_no_cheap_plan():
     assert outcomes[1].is_much_better_than(outcomes[0], 0.7)
 
 
-def test_a_hard_bound_missed_by_rounding_is_kept_in_what_inputs_lead_to():
+def test_a_hard_bound_missed_by_rounding_counts_as_kept():
     model = KnownModel(lambda x, u: x + u, 1, 1)
     wall = Box(None, [1.0], penalty=None)
     problem = Problem(Tracking([1.0], [1e-3]), constraints=[wall])

@@ -161,7 +161,7 @@ def test_what_is_held_stays_held_between_decisions(on_failure):
     assert not np.allclose(loop.input_between(planned - 0.2, 0.0), loop.last.input)
 
 
-def test_what_the_policy_goes_on_along_costs_and_misses_nothing_that_is_known():
+def test_a_policys_plan_has_no_known_cost_or_violation():
     loop = ControlLoop(controller())
     loop.input(np.zeros(2), GOAL)
     solved = loop.last.plan
@@ -269,7 +269,7 @@ class Filtered:
         return replace(self.last, means=means, covariances=np.zeros((11, 1, 1)))
 
 
-def test_a_controller_that_estimates_more_than_is_measured_is_judged():
+def test_a_controller_that_estimates_more_states_is_judged():
     loop = ControlLoop(Filtered(controller()))
     x = np.zeros(2)
     for _ in range(30):
@@ -281,7 +281,7 @@ def test_a_controller_that_estimates_more_than_is_measured_is_judged():
     assert loop.judgement.level == "suspicious"
 
 
-def test_a_controller_around_others_has_the_model_of_the_innermost():
+def test_a_controller_around_others_has_the_innermost_model():
     class Around:
         def __init__(self, inner):
             self.controller = inner

@@ -244,7 +244,7 @@ def test_an_estimate_outlives_a_plan_that_cannot_be_gone_on_from():
     np.testing.assert_allclose(again.disturbance, [0.0, 0.08], atol=1e-12)
 
 
-def test_an_estimate_outlives_a_missing_measurement_without_a_loop():
+def test_an_estimate_outlives_a_gap_without_a_loop():
     mpc = controller(disturbance_gain=0.5)
     states, decisions = flown(mpc, steps=5)
     unmeasured = Gaussian.certain(np.full(2, np.nan))

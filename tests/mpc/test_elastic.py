@@ -65,7 +65,7 @@ def test_an_elastic_bound_is_exact_where_it_can_be_kept(start):
 
 @pytest.mark.parametrize("penalty", ["elastic", "exact"])
 @pytest.mark.parametrize("length", [1e-6, 1e-3, 1.0, 1e3])
-def test_a_bound_that_can_be_kept_is_kept_however_its_row_is_scaled(penalty, length):
+def test_a_bound_that_can_be_kept_is_kept_at_any_scale(penalty, length):
     """A pressure of half a megapascal, in pascals, and its row as large as one."""
     model = KnownModel(lambda x, u: x + u, 1, 1)
     row = Halfspaces([[length]], [length * 5e5], penalty=penalty)
@@ -284,7 +284,7 @@ def test_a_vehicle_pushed_out_of_its_lane_returns_without_a_spin(iterations):
     assert ends["default"] < 1.1 * max(0.2, ends["none"])
 
 
-def test_a_bound_that_can_be_kept_is_not_sold_with_one_that_cannot():
+def test_a_bound_that_can_be_kept_keeps_its_price():
     """Heat that takes long to leave, beside a wall that a slide need not cross."""
     model = LinearGaussian(
         [[0.99, 0.0], [0.0, 1.0]], [[0.01, 0.0], [0.0, 1.0]], c=[0.0, 0.0]
@@ -436,7 +436,7 @@ def test_each_elastic_row_is_priced_once_a_step():
     assert second[0] == first[0]
 
 
-def test_a_row_that_a_later_program_keeps_gets_its_exact_price_back():
+def test_a_row_that_a_later_program_keeps_has_its_exact_price():
     """Once: where it is missed after all, it is priced for good."""
     exact, first, missed, kept, again, last = prices_of_rows(
         starts=([2.0, 0.0], [2.0, 0.0], [0.9, 0.0], [2.0, 0.0], [0.9, 0.0]),

@@ -117,7 +117,7 @@ def test_outputs_and_violations_count_with_their_parameters():
     assert costs.total == pytest.approx(np.add(errors, violations), rel=1e-12)
 
 
-def test_a_bound_missed_by_rounding_costs_nothing_at_its_exact_price():
+def test_a_bound_missed_by_rounding_costs_nothing():
     walls = [Box(None, [1.0, np.inf], penalty="exact")]
     meter = StageMeter(pendulum_problem(constraints=walls), 2)
     states = np.array([[0.0, 0.0], [1.0 + 2e-9, 0.0], [1.1, 0.0]])
@@ -314,7 +314,7 @@ def test_shares_of_costs_and_of_violations_are_compared_apart():
     assert left == CostSum(weighed=6.0, violations=0.0, beyond=0)
 
 
-def test_a_flight_that_grazes_a_hard_bound_is_measured_by_its_other_stages():
+def test_a_grazed_hard_bound_is_measured_by_the_other_stages():
     costs = FlownCosts(
         np.array([4.0, 9e9, 2.0, 1.0]), np.ones(4), np.array([0.0, np.inf, 0.0, 0.0])
     )

@@ -220,7 +220,7 @@ def test_each_input_at_a_bound_has_its_own_yardstick():
     assert judgement.reason.startswith("input 0 is at its bound for 45 steps")
 
 
-def test_plans_that_cost_less_than_the_first_do_not_cost_ever_more():
+def test_plans_cheaper_than_the_first_do_not_climb():
     judge = FlightJudge(CONTROLLER.problem)
     distances = np.concatenate([np.full(10, 10.0), np.linspace(2.0, 1.0, 25)])
     distances = np.concatenate([distances, 1.2 ** np.arange(25)])
@@ -464,7 +464,7 @@ def test_a_state_that_is_to_stay_is_not_frozen():
         assert "is measured the same" not in judgement.reason
 
 
-def test_an_input_at_its_bound_from_the_first_unknown_step_is_named():
+def test_an_input_at_its_bound_from_the_first_step_is_named():
     judge = FlightJudge(CONTROLLER.problem)
     for k in range(50):
         measured = np.full(2, np.nan) if k == 0 else np.array([1.0, 0.01 * (k % 2)])
@@ -489,7 +489,7 @@ def judged_at(distances, **by_step):
     return judgements
 
 
-def test_a_step_without_a_plan_is_judged_by_the_horizon_of_the_last():
+def test_a_step_without_a_plan_is_judged_by_the_last_horizon():
     judge = FlightJudge(CONTROLLER.problem)
     means = np.tile([1.0, 0.0], (51, 1))
     long_plan = replace(

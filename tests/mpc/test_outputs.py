@@ -333,7 +333,7 @@ def test_mistakes_are_one_clear_error():
         controller.control(at, GOAL, plan=plan)
 
 
-def test_a_first_plan_counts_whose_inputs_lead_where_its_cost_is_not_known():
+def test_a_first_plan_counts_where_its_followed_cost_is_unknown():
     """The plan stays where the logarithm is finite; the model from its inputs not."""
     model = KnownModel(lambda x, u: x + u + 5.0 * u**2, state_dim=1, input_dim=1)
     barrier = LeastSquares(lambda x: torch.log(2.0 - x), [[0.01]])
@@ -400,7 +400,7 @@ def test_a_cost_of_outputs_that_rounds_below_zero_is_none(goal):
             assert np.abs(last.input).max() < 1e-3
 
 
-def test_a_first_plan_whose_inputs_lead_out_of_an_output_gives_way():
+def test_a_first_plan_that_leads_out_of_an_output_gives_way():
     """One program's inputs lead to a negative state; those of more do not."""
     model = KnownModel(lambda x, u: x + 0.2 * (u - 2.455 * x), 1, 1)
     output = LeastSquares(torch.log, [0.121], reference=[-0.7024])

@@ -130,7 +130,7 @@ def test_the_penalty_is_infinite_as_given_or_above_any_weight():
     assert (problem.prices(Box([0.0] * 2), units) == 1e6 * 200.0).all()
 
 
-def test_an_exact_price_is_one_of_a_distance_however_rows_are_scaled():
+def test_an_exact_price_is_of_a_distance_at_any_scale_of_rows():
     problem = Problem(Tracking([1.0, 200.0], [3.0]))
     F = np.array([[3e-6, 4e-6], [0.0, -1e3]])
     for penalty in ("elastic", "exact"):
@@ -186,7 +186,7 @@ def test_a_weight_may_be_skew_by_round_off_and_no_more(skew):
                 Tracking(weight, [1.0])
 
 
-def test_a_weight_that_was_computed_is_symmetric_but_for_rounding_of_its_sums():
+def test_a_computed_weight_is_symmetric_but_for_rounding():
     # Sums that cancel leave other digits on both sides, as of M.T @ Q @ M.
     weight = np.array([[0.5, 1e-17], [2e-17, 1.6]])
     assert np.array_equal(Tracking(weight, [1.0]).Q, weight)

@@ -113,7 +113,7 @@ def test_a_spent_budget_ends_whole_steps_too():
 
 
 @pytest.mark.parametrize("price", ["elastic", "exact", 30.0])
-def test_a_curved_bound_that_is_kept_takes_as_many_programs_at_any_price(price):
+def test_a_kept_curved_bound_takes_as_many_programs_at_any_price(price):
     """A step along it misses it in second order, which is not to be refused."""
     belief = Gaussian.certain(np.array([0.9, 0.0]))
     reference = Reference(np.array([1.3, 0.4]))

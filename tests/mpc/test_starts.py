@@ -400,7 +400,7 @@ def test_plans_that_differ_in_a_small_input_are_two():
     assert not one._are_alike(swing + 0.11, swing)
 
 
-def test_a_plan_to_a_reference_that_moves_is_judged_by_all_of_its_cost():
+def test_a_plan_to_a_moving_reference_is_judged_by_all_its_cost():
     """By outputs, by bounds that it misses, and by the increment of its first input."""
 
     def off_three(x, u, p):
@@ -676,7 +676,7 @@ def test_plans_are_made_start_by_start_from_any_start_on():
     )
 
 
-def test_the_novelty_of_a_followed_flight_is_that_of_its_own_plan():
+def test_the_novelty_of_a_followed_flight_is_of_its_plan():
     problem = Problem(Tracking([1.0, 0.1], [0.05]), Box([-2.0], [2.0]))
     controller = GPMPC(pendulum_posterior(), Linearization(), problem, 8, [0.0])
     decision = ManyStarts(controller).control(

@@ -210,7 +210,7 @@ def test_a_plan_stays_where_the_next_program_has_no_numbers():
     np.testing.assert_allclose(decision.inputs, alone.inputs)
 
 
-def test_a_missed_hard_bound_ends_alike_with_and_without_time_for_more_programs():
+def test_a_missed_hard_bound_ends_alike_with_and_without_time():
     alone = level(None, slope_at_edge=False, iterations=1)
     late = level(None, slope_at_edge=False, budget=1e-9)
     assert alone.violation > 1e-3

@@ -187,9 +187,7 @@ def test_what_a_wrapper_adds_hides_no_lost_derivatives(propagator, wrap):
     [MeanEquivalence(), Linearization(), Unscented(), MonteCarlo(20)],
     ids=_name,
 )
-def test_functions_in_casadi_have_derivatives_and_lost_ones_are_refused(
-    propagator, batch
-):
+def test_casadi_functions_with_lost_derivatives_are_refused(propagator, batch):
     x = casadi.SX.sym("x", 2)
     u = casadi.SX.sym("u")
     next_state = casadi.vertcat(casadi.sin(x[0]) * u, x[0] * x[1] + 1.0)

@@ -77,7 +77,7 @@ def test_an_answer_with_large_residuals_is_not_called_solved(rng):
     assert solution.status is Status.NUMERICAL_TROUBLE
 
 
-def test_what_doubled_digits_make_of_an_answer_counts_where_it_is_better():
+def test_an_answer_in_doubled_digits_counts_where_it_is_better():
     """They stop after a few changes, far from where the solver was."""
     problem = feasible_problem(np.random.default_rng(5), 60, 120)
     solution = CvxpySolver("OSQP").solve(problem)

@@ -76,7 +76,7 @@ def test_solved_means_optimal_and_infeasible_means_infeasible(
 
 
 @pytest.mark.parametrize("seed", [7, 66])
-def test_the_primal_method_keeps_a_solution_that_doubled_digits_lose(seed):
+def test_the_primal_method_keeps_what_doubled_digits_lose(seed):
     problem = near_dependent_problem(np.random.default_rng(seed))
     solution = PrimalActiveSet().solve(problem)
     assert solution.status is Status.SOLVED

@@ -78,9 +78,7 @@ def test_a_refused_problem_is_not_answered_from_stale_memory(monkeypatch):
 
 @pytest.mark.parametrize(("size", "bound"), [(1e300, -1.0), (1e-170, -1e-170)])
 @pytest.mark.parametrize("mode", ["prepared", "changing"])
-def test_a_row_whose_squares_no_float_holds_is_not_taken_as_satisfied(
-    mode, size, bound
-):
+def test_a_row_whose_squares_overflow_is_not_satisfied(mode, size, bound):
     q = np.array([1.0, -2.0, 1.0])
     upper = np.array([np.inf, np.inf, np.inf, bound])
     row = size * np.array([[1.0, 2.0, 0.0]])

@@ -148,9 +148,7 @@ def test_an_animation_is_whole_or_as_it_was(tmp_path, monkeypatch):
     assert (tmp_path / "flight.gif").read_bytes() == b"old"
 
 
-def test_figures_of_a_tree_lie_below_it_and_an_error_ends_no_other(
-    tmp_path, monkeypatch, capsys
-):
+def test_figures_of_a_tree_lie_below_it_whatever_fails(tmp_path, monkeypatch, capsys):
     """However many runs there are; one run's own folder is no tree."""
     drawn = []
 

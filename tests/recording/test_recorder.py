@@ -365,9 +365,7 @@ def test_a_step_that_cannot_follow_is_refused_at_once(tmp_path, change, message)
     assert read_run(path).steps.tolist() == [3, 4]
 
 
-def test_a_recorder_that_cannot_be_made_leaves_the_file_to_others(
-    tmp_path, monkeypatch
-):
+def test_a_recorder_that_fails_to_open_leaves_the_file_alone(tmp_path, monkeypatch):
     def full(name, context):
         raise RuntimeError("no port is left")
 

@@ -344,7 +344,7 @@ def test_a_plant_that_leaves_the_finite_numbers_is_said_so():
     assert caught.value.rollout is None
 
 
-def test_a_belief_that_overflows_diverges_and_keeps_what_was_flown():
+def test_a_belief_that_overflows_ends_the_flight_as_diverged():
     unstable = KnownModel(lambda x, u: 1e3 * x + u, 2, 1)
 
     class Regulator(Feedback):
@@ -513,7 +513,7 @@ class InPlaceCart(Cart):
         return x
 
 
-def test_what_is_handed_out_is_no_part_of_the_plant_or_the_record():
+def test_arrays_handed_out_are_no_part_of_plant_or_record():
     plant = System(InPlaceCart(), time_step=0.1, substeps=1)
     careless = InPlace()
     flight = fly(controller=careless, plant=plant, disturbances=[careless])

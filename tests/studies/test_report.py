@@ -133,7 +133,7 @@ def test_a_gap_that_a_run_of_another_sweep_stands_for_is_told(tmp_path):
     )
 
 
-def test_a_failed_run_that_chose_no_seed_flies_again_in_its_folder(tmp_path):
+def test_a_failed_run_without_a_seed_flies_again_in_its_folder(tmp_path):
     choices = ["controller=lqr"]
     settings = SETTINGS | {"seed": 0, "options": {"controller": "lqr"}}
     made_up_run(tmp_path, choices, settings, error="killed")
@@ -639,7 +639,7 @@ def test_one_value_is_one_cell_however_it_was_typed(typed, tmp_path):
     assert compare(report, "gain=0.0", "gain=3e-1")[0].pairs == 3
 
 
-def test_what_is_missing_flies_with_the_settings_that_were_asked_for(tmp_path):
+def test_missing_runs_fly_with_the_settings_asked_for(tmp_path):
     for seed in range(2):
         fly(tmp_path, ["system=pendulum", f"seed={seed}"], seed=seed, horizon=30)
         choices = ["horizon=5", "system=pendulum", f"seed={seed}"]

@@ -230,7 +230,7 @@ def test_attempts_that_were_ended_from_outside_are_counted(tmp_path):
     assert folder.outside_attempts == 0
 
 
-def test_settings_that_are_no_number_do_not_differ_from_themselves():
+def test_settings_of_nan_do_not_differ_from_themselves():
     def settings(bias):
         return {"noise": {"std": float("nan")}, "gains": [{"a": float("nan")}, bias]}
 

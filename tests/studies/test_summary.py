@@ -296,7 +296,7 @@ def test_the_metrics_of_a_flight_are_written_out_in_full():
     assert measured(rollout_of(errors))["times"]["training"] is None
 
 
-def test_commands_and_decisions_are_measured_not_noise_and_silence():
+def test_commands_and_decisions_are_measured_without_noise():
     """An actuator's noise breaks no bound; who was not asked took no time."""
     timings = (Timing(), Timing(), Timing(1e-3, 1e-3, 2e-3))
     rollout = rollout_of(

@@ -27,7 +27,7 @@ def test_a_legend_stays_within_its_figure(label, count):
     assert box.x1 <= figure.bbox.x1
 
 
-def test_a_lone_flight_stands_on_its_tick_and_others_side_by_side():
+def test_a_lone_flight_is_drawn_on_its_tick_and_others_beside():
     both = [Series("a", [[1.0], [2.0], []]), Series("b", [[1.0], [], [3.0]])]
     figure = over_variable("controller", ["x", "y", "z"], "RMSE [m]", both)
     (axis,) = figure.axes

@@ -367,7 +367,7 @@ def test_episodes_train_their_models():
         experiment(learning=EpisodicLearning(2))
 
 
-def test_online_learning_beside_a_disturbance_estimate_is_refused_before_a_training():
+def test_learning_beside_an_estimate_is_refused_before_training():
     plain = experiment(learning=OnlineLearning())
     settings = PredictionSettings(disturbance_gain=0.3)
     estimating = partial(plain.controller, prediction=settings)

@@ -105,7 +105,7 @@ def test_our_environment_moves_as_its_system_and_ends_when_lost():
     assert np.hypot(state[0], state[2]) > 10
 
 
-def test_a_cart_at_rest_under_a_hanging_pole_is_far_from_its_goal():
+def test_a_cart_under_a_hanging_pole_is_far_from_its_goal():
     environment = make_environment("cart_pole")
     environment.reset(seed=0)
     reward = environment.step(np.zeros(1))[1]
@@ -194,7 +194,7 @@ def test_an_episode_that_ends_is_a_lost_flight():
         )
 
 
-def test_a_simulator_is_an_environment_that_starts_where_it_starts():
+def test_a_simulator_as_an_environment_starts_where_it_does():
     environment = make_environment(pendulum_environment())
     start, _ = environment.reset(seed=1)
     after = environment.step(np.zeros(1))[0]
@@ -204,7 +204,7 @@ def test_a_simulator_is_an_environment_that_starts_where_it_starts():
         make_environment(planar_quadrotor(), mass=2.0)
 
 
-def test_inputs_of_joints_are_recorded_within_what_they_are_clipped_to(cart):
+def test_inputs_of_joints_are_recorded_as_clipped(cart):
     joints = mujoco_system(cart, ["push"], joints=["slider", "hinge"])
     flight = closed_loop(
         joints, Pushing(20.0), np.zeros((4, 4)), np.zeros(4), 2, noise=Noise(input=[1])
@@ -364,7 +364,7 @@ def test_misuse_of_simulators_is_one_clear_line(cart, tmp_path, monkeypatch):
         mujoco_system(cart, ["push"], joints=["slider", "hinge"])
 
 
-def test_a_hopper_that_falls_ends_and_one_that_spins_shows_another_state():
+def test_a_falling_hopper_ends_and_a_spinning_one_is_not_set():
     """It ends by itself once it leans, and shows velocities up to 10 alone."""
     pytest.importorskip("imageio")  # which gymnasium's MuJoCo environments need
     whole = {"exclude_current_positions_from_observation": False}

@@ -249,7 +249,7 @@ def test_misuse_is_refused_where_the_system_is_made(settings, error, message):
         System(**(defaults | settings))
 
 
-def test_a_car_at_rest_is_not_turned_and_backwards_it_turns_the_other_way():
+def test_a_car_turns_the_other_way_backwards_and_not_at_rest():
     car = dynamic_bicycle().dynamics
     assert car.derivative([0.0] * 6, [0.3, 0.0]) == pytest.approx([0.0] * 6)
     forwards = car.derivative([0.0, 0.0, 0.0, 2.0, 0.0, 0.0], [0.3, 0.0])
