@@ -15,6 +15,7 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.gp import Trainer, Transitions
 from gpmpc.gp.casadi_ import successor_function
 from gpmpc.models import Affine, KnownModel, ResidualModel
+from gpmpc.models._nominal import lost_derivative
 from gpmpc.mpc import GPMPC, Inequality, LeastSquares, Problem, Reference, Tracking
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.propagation import Linearization
@@ -213,11 +214,27 @@ def test_a_function_of_a_lost_derivative_is_refused(lost):
         lambda x: 1e4 * (3.0 * x.float() + torch.exp(x.float())).double(),
         lambda x: torch.floor(x) + torch.log(x) / (x - 0.5),
         lambda x: 1e9 + torch.exp(300.0 * x),
+        lambda x: x + 1e16 * x / x.norm(dim=-1, keepdim=True) ** 3,
+        lambda x: x + 0.01 * torch.sin(2.0 * np.pi * x / 1e-3),
+        lambda x: (0.3 * x.float() + 1e5 - 1e5).double(),
+        lambda x: x + (x.round() - x).detach(),
     ],
 )
 def test_kinks_single_precision_and_edges_lose_no_derivative(whole):
     KnownModel(lambda x, u: whole(x) + u, 2, 1)
     KalmanFilter.extended(MODEL, Measurement(2, torch.eye(2, dtype=F), whole))
+
+
+@pytest.mark.parametrize("width", [1e-2, 5e-4, 1e-6, 0.0])
+def test_friction_at_rest_loses_no_derivative(width):
+    def sliding(x, u):
+        force = torch.tanh(x / width) if width else torch.relu(x)
+        return x + 0.01 * (u - 2.0 * force)
+
+    at_rest = np.zeros((2, 1))
+    for dtype in (torch.float32, F):
+        like = torch.zeros(1, dtype=dtype)
+        assert lost_derivative(sliding, like, at_rest, at_rest) is None
 
 
 def plant(function):

@@ -240,8 +240,7 @@ class Slurm:
         queue = _queue() if folders else None
         for folder in folders:
             # Where Slurm does not know it, its sweep was killed before it submitted it.
-            is_silent = queue is None
-            in_queue = is_silent or any(name == folder.name for name, _ in queue)
+            in_queue = queue is None or any(name == folder.name for name, _ in queue)
             if in_queue or (folder / _SUBMITTED).exists():
                 array = self._read_array(folder)
                 if array is not None:

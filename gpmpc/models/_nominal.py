@@ -23,7 +23,10 @@ from gpmpc.exceptions import GpmpcError, SettingError, ShapeError, check_number
 from gpmpc.gaussian import Gaussian, check_tensors
 from gpmpc.signals import UNKNOWN, Signals
 
-_WIDTH = 1e-3  # of the steps of differences, besides a point's size
+# Steps of differences, besides a point's size, from the widest on: what is finer than
+# the first two shows between the last two.
+_WIDTHS = (2e-3, 1e-3, 2e-5, 1e-5)
+_ROUNDING = 1.2e-7  # of a number in single precision, in which functions may compute
 
 
 @explains_arguments
@@ -269,10 +272,13 @@ def lost_derivative(
     """Says which derivative of a function torch loses; None where it loses none.
 
     A part that torch could not follow (``.detach()``, NumPy, ``torch.tensor``) is
-    missing in its derivatives. Central differences of two widths say what they should
-    be, and how far they are to be trusted: of values in single precision, or that bend
-    within a width, the two differ. An entry counts where it is wrong at every point at
-    which it is a number, so that a kink at one of them does not.
+    missing in its derivatives. Differences to both sides of a point, of four widths
+    from 2e-3 to 1e-5, say what they should be, where they agree: at kinks, of what is
+    finer than their widths, and of values that rounding takes away they do not. A
+    difference that rounding of the values in single precision may make says nothing,
+    nor does a value that stays the same, as of a straight-through estimator. Rather
+    is a lost part missed than a right function refused. An entry counts where it is
+    wrong at every point at which it is a number.
 
     Args:
         function: See ``linearize_function``.
@@ -281,23 +287,34 @@ def lost_derivative(
         angles: Columns of the first argument that are angles: they may count turns,
             which change no slope.
     """
-    _, *jacobians = linearize_function(function, model, *arguments)
+    values, *jacobians = linearize_function(function, model, *arguments)
+    K = len(values)
+    values = values.reshape(K, -1)
+    v = values.shape[1]
     points = np.concatenate(arguments, axis=1)
-    width = _WIDTH * (1.0 + np.abs(points))
-    width[:, list(angles)] = _WIDTH
+    scale = 1.0 + np.abs(points)
+    scale[:, list(angles)] = 1.0
     sizes = [argument.shape[1] for argument in arguments]
     values_at = partial(_values_at, function, model, sizes)
-    narrow = _central_differences(values_at, points, width)
-    wide = _central_differences(values_at, points, 2.0 * width)
-    K, v, _ = narrow.shape
     flat = [
         part.reshape(K, v, size) for part, size in zip(jacobians, sizes, strict=True)
     ]
     slopes = np.concatenate(flat, axis=2)
     with np.errstate(invalid="ignore", over="ignore"):
-        excess = np.abs(narrow - slopes) - np.abs(wide - narrow)
-        is_off = excess > 1e-3 * (1.0 + np.abs(narrow))
-    is_number = np.isfinite(excess)
+        sided = [
+            _one_sided_differences(values_at, points, values, side * width * scale)
+            for width in _WIDTHS
+            for side in (1.0, -1.0)
+        ]
+        differences = np.stack(sided)
+        size = np.abs(differences).max(axis=0)
+        spread = differences.max(axis=0) - differences.min(axis=0)
+        excess = np.abs(differences - slopes).min(axis=0)
+        rounding = _ROUNDING * np.abs(values)[:, :, None] / scale[:, None] / _WIDTHS[1]
+        have_converged = (spread < 0.03 * size) & (spread < 0.3 * excess)
+        is_clear = excess > 1e-3 + 0.01 * np.maximum(size, np.abs(slopes))
+        is_off = have_converged & is_clear & (excess > 10.0 * rounding)
+    is_number = np.isfinite(spread) & np.isfinite(excess)
     is_wrong = (is_off | ~is_number).all(axis=0) & is_number.any(axis=0)
     if not is_wrong.any():
         return None
@@ -306,9 +323,9 @@ def lost_derivative(
     return (
         "must be followed by torch as a whole: the derivative of its entry "
         f"{output + 1} by column {column + 1} of (x, u) is "
-        f"{narrow[point, output, column]:.3g}, and torch finds "
+        f"{differences[-1, point, output, column]:.3g}, and torch finds "
         f"{slopes[point, output, column]:.3g} (a part is lost by .detach(), numpy or "
-        "torch.tensor)"
+        "torch.tensor); where that is meant, give it a method linearize"
     )
 
 
@@ -331,18 +348,22 @@ def _values_at(
         return to_array(function(*tensors).flatten(1))
 
 
-def _central_differences(
-    values_at: Callable[[Array], Array], points: Array, width: Array
+def _one_sided_differences(
+    values_at: Callable[[Array], Array], points: Array, values: Array, steps: Array
 ) -> Array:
-    """Differentiates entries (K, v) by points (K, d), with widths (K, d) of steps.
+    """Differentiates entries (K, v) by points (K, d), to one side of each.
+
+    Args:
+        values_at: Of points (any, d).
+        points: (K, d).
+        values: There (K, v).
+        steps: To where values are compared, with their signs (K, d).
 
     Returns:
         The differences (K, v, d).
     """
     K, d = points.shape
-    steps = width[:, None] * np.eye(d)
-    above = values_at((points[:, None] + steps).reshape(K * d, d))
-    below = values_at((points[:, None] - steps).reshape(K * d, d))
-    with np.errstate(invalid="ignore", over="ignore"):
-        change = (above - below).reshape(K, d, above.shape[1])
-        return (change / (2 * width[:, :, None])).swapaxes(1, 2)
+    moved = points[:, None] + steps[:, None] * np.eye(d)
+    moved_values = values_at(moved.reshape(K * d, d)).reshape(K, d, values.shape[1])
+    changes = moved_values - values[:, None]
+    return (changes / steps[:, :, None]).swapaxes(1, 2)
