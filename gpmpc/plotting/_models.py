@@ -263,14 +263,13 @@ def _draw_intervals(axis: Axes, judgement: "Judgement", group: int) -> None:
         steps, judgement.width[:, group], color=VERMILION, marker="s", linestyle="--"
     )
     axis.axhline(judgement.level, color="0.6", linewidth=0.8)
-    shown = np.concatenate([coverage, low, judgement.width[:, group]])
+    shown = np.concatenate(
+        [coverage, low, judgement.width[:, group], [judgement.level]]
+    )
     shown = shown[np.isfinite(shown)]
     axis.set(
         xscale="log",
-        ylim=(
-            min(0.5, shown.min(initial=0.5) - 0.05),
-            max(1.5, 1.1 * shown.max(initial=1.5)),
-        ),
+        ylim=(min(0.5, shown.min() - 0.05), max(1.5, 1.1 * shown.max())),
         xlabel="steps ahead",
     )
 

@@ -181,8 +181,9 @@ def _differing_settings(runs: Sequence[Any]) -> dict[str, None]:
 
 def _differ(run: Any, other: Any, key: str) -> bool:
     """Whether two runs have other values of a setting, and not by their seeds alone."""
-    value = run.settings.get(key, MISSING)
-    other_value = other.settings.get(key, MISSING)
+    # A setting that is absent is null, as where a sweep compares two runs.
+    value = run.settings.get(key)
+    other_value = other.settings.get(key)
     if is_same(value, other_value):
         return False
     return not is_same(
@@ -192,6 +193,8 @@ def _differ(run: Any, other: Any, key: str) -> bool:
 
 def _without_seed(value: Any, seed: str) -> Any:
     """Returns a value with a mark where it is the seed, or names it."""
+    if isinstance(value, list):
+        return [_without_seed(element, seed) for element in value]
     if isinstance(value, str):
         return re.sub(rf"(?<!\d){re.escape(seed)}(?!\d)", MISSING, value)
     return MISSING if str(value) == seed else value

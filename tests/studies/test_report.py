@@ -612,6 +612,9 @@ def test_runs_of_one_cell_that_have_other_settings_are_told(tmp_path):
         choices = [f"seed={seed}"]
         own = {"seed": seed, "model": {"seed": seed, "rows": f"rows_{seed}.csv"}}
         own["model"]["restarts"] = 3  # which is a seed, too
+        own["model"]["starts"] = [seed, 7]
+        if seed > 2:
+            own["offset"] = None  # as where it is absent
         steps = 200 if seed > 2 else 100
         fly(tmp_path / "mixed", choices, **own, steps=steps)
         fly(tmp_path / "alike", choices, **own)
