@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from gpmpc.exceptions import DataError
-from gpmpc.logs._file import STAMP, Tables
+from gpmpc.logs._file import STAMP, Tables, doubts_of, with_doubts
 from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._units import said_units, unit_text_of_time, units_of, with_units
 
@@ -81,6 +81,7 @@ def named_columns(path: str | Path, tables: Tables, mapping: LogMapping) -> Tabl
         )
     names_in_file = list(table.columns)
     unit_by_name = said_units(table)
+    doubt_by_name = doubts_of(table)
     if mapping.names:
         others = table.columns[len(mapping.names) :]
         table = with_unique_names(table.set_axis([*mapping.names, *others], axis=1))
@@ -101,7 +102,11 @@ def named_columns(path: str | Path, tables: Tables, mapping: LogMapping) -> Tabl
         units.append(unit)
     unit_of_column = dict(zip(table.columns, units, strict=True))
     unit_of_column |= {name: units[number - 1] for name, number in numbers.items()}
-    return {**tables, "": with_units(table.assign(**by_number), unit_of_column)}
+    doubts = [doubt_by_name.get(name, "") for name in names_in_file]
+    doubt_of_column = dict(zip(table.columns, doubts, strict=True))
+    doubt_of_column |= {name: doubts[number - 1] for name, number in numbers.items()}
+    table = with_units(table.assign(**by_number), unit_of_column)
+    return {**tables, "": with_doubts(table, doubt_of_column)}
 
 
 def _columns_of_times(mapping: LogMapping) -> set[str]:
@@ -147,6 +152,9 @@ def runs_side_by_side(
         units = units_of(table)
         own_units = {name: units.get(column, "") for name, column in columns.items()}
         own = with_units(own, {**units, **own_units})
+        doubts = doubts_of(table)
+        own_doubts = {name: doubts.get(column, "") for name, column in columns.items()}
+        own = with_doubts(own, {**doubts, **own_doubts})
         yield TablesOfRun(run, _until_last_value({"": own}, mapping))
 
 

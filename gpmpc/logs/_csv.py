@@ -15,6 +15,7 @@ import pandas as pd
 
 from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import DataError
+from gpmpc.logs._columns import with_unique_names
 from gpmpc.logs._csv_numbers import read_marked_numbers
 from gpmpc.logs._csv_text import DELIMITERS, WHITE_SPACE, CsvText, open_csv
 from gpmpc.logs._file import (
@@ -26,6 +27,7 @@ from gpmpc.logs._file import (
     check_column_count,
     run_name,
     with_blocks,
+    with_doubts,
 )
 from gpmpc.logs._findings import Finding
 from gpmpc.logs._list_cells import unpack_lists
@@ -53,12 +55,16 @@ def read_csv(path: Path, options: ReadOptions) -> LogFile:
     swallowed = csv.stream.rows - len(table)
     table.columns = _column_names(csv)
     units = dict(zip(table.columns, csv.units, strict=False))
-    table, unsure = read_marked_numbers(
-        str(path), _without_empty_end(table), csv.decimal
-    )
+    table, unsure, doubts = read_marked_numbers(_without_empty_end(table), csv.decimal)
+    unique_names = with_unique_names(table).columns
+    doubt_by_name = {str(unique_names[index]): doubts[index] for index in doubts}
     table = unpack_lists(path, table, budget)
-    findings = (*_findings(path, csv, swallowed), *_unsure_marks(path, unsure))
-    table = with_units(table, units)
+    findings = (
+        *_findings(path, csv, swallowed),
+        *_unsure_marks(path, unsure),
+        *(Finding("thousands", run_name(path), 1, doubts[index]) for index in doubts),
+    )
+    table = with_doubts(with_units(table, units), doubt_by_name)
     if not swallowed:  # lines are rows
         table = with_blocks(table, blocks_of(csv.rows_behind_blank, len(table)))
     return LogFile({"": table}, findings)

@@ -2,8 +2,8 @@
 
 The decimal mark of a text is known by its first rows. Where these hold whole numbers,
 or programs of two countries wrote the columns, others follow. ``1,024`` is 1024 to one
-program and 1.024 to another: it is taken for neither where the column or the file says
-that it may be thousands.
+program and 1.024 to another. Where the column or the file says that it may be
+thousands, the column stays text, and a mapping that reads it is refused.
 """
 
 import re
@@ -11,8 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-
-from gpmpc.exceptions import DataError
 
 MARKS = {",": "comma", ".": "point"}
 _OTHER = {",": ".", ".": ","}
@@ -26,6 +24,7 @@ _THOUSANDS = {
     for mark in MARKS
 }
 _WHOLE = re.compile(r"[+-]?\d+")
+_POWER = re.compile(r"[+-]?\d+[eE][+-]?\d+")  # 1e-3: a number without a mark
 _LARGE = 100  # a whole number from which on 1,024 beside it is rather 1024
 
 
@@ -35,6 +34,11 @@ class _Cells(NamedTuple):
     marked: list[str]  # numbers with the mark
     whole: list[str]  # numbers without any
     thousands: bool  # all that are marked may have the mark for thousands
+
+    @property
+    def have_several_marks(self) -> bool:
+        """Whether a number has the mark more than once, as 1,024,000 has."""
+        return any(sum(map(number.count, MARKS)) > 1 for number in self.marked)
 
     @property
     def are_doubtful(self) -> bool:
@@ -86,18 +90,15 @@ class MarkedNumbers(NamedTuple):
 
     table: pd.DataFrame
     unsure: list[str]  # columns that may hold thousands, and were taken as decimals
+    doubts: dict[int, str]  # by columns that rather hold thousands, and stay text
 
 
-def read_marked_numbers(where: str, table: pd.DataFrame, decimal: str) -> MarkedNumbers:
+def read_marked_numbers(table: pd.DataFrame, decimal: str) -> MarkedNumbers:
     """Makes numbers of columns of texts that all hold one, with either decimal mark.
 
     Args:
-        where: The file's name, for errors.
         table: As pandas read it.
         decimal: The mark that it was told.
-
-    Raises:
-        DataError: A column rather has marks of thousands.
     """
     texts = {}  # by the number of the column
     has_decimals = dict.fromkeys(MARKS, False)
@@ -116,59 +117,63 @@ def read_marked_numbers(where: str, table: pd.DataFrame, decimal: str) -> Marked
             cells = _cells(numbers, mark)
             has_decimals[mark] |= bool(cells.marked) and not cells.thousands
     unsure = []
+    doubts = {}
     columns = {}
     for index, numbers in texts.items():
         name = str(table.columns[index])
         marks = [mark for mark in MARKS if any(mark in number for number in numbers)]
         for mark in marks:
             cells = _cells(numbers, mark)
-            if cells.thousands and (has_decimals[_OTHER[mark]] or cells.are_doubtful):
-                _refuse(where, name, cells, mark)
-            if cells.thousands and not has_decimals[mark]:
+            has_other_mark = has_decimals[_OTHER[mark]]
+            if has_decimals[mark]:  # of other columns, whose numbers surely have it
+                is_doubtful = has_other_mark and mark != decimal
+            else:
+                is_doubtful = has_other_mark or cells.are_doubtful
+            if cells.have_several_marks or (cells.thousands and is_doubtful):
+                doubts[index] = _doubt(name, cells, mark)
+            elif cells.thousands and not has_decimals[mark]:
                 unsure.append(name)
-        if len(marks) < 2:
-            columns[index] = _as_floats(table.iloc[:, index], marks)
+        if len(marks) < 2 and index not in doubts:
+            columns[index] = _as_floats(table.iloc[:, index])
     if not columns:
-        return MarkedNumbers(table, unsure)
+        return MarkedNumbers(table, unsure, doubts)
     series = [
         columns.get(index, table.iloc[:, index]) for index in range(len(table.columns))
     ]
-    return MarkedNumbers(pd.concat(series, axis=1), unsure)
+    return MarkedNumbers(pd.concat(series, axis=1), unsure, doubts)
 
 
 def _numbers_of(column: pd.Series) -> list[str] | None:
     """Returns the texts of a column as they stand there; None where one is no number.
 
-    Numbers that pandas made of a part of the rows were whole ones.
+    Numbers that pandas made of a part of the rows are written as it writes them.
     """
     numbers = []
     for cell in column.dropna():
         text = cell.strip() if isinstance(cell, str) else f"{cell:.17g}"
-        forms = (_WHOLE, *_NUMBERS.values(), *_THOUSANDS.values())
+        forms = (_WHOLE, _POWER, *_NUMBERS.values(), *_THOUSANDS.values())
         if not any(form.fullmatch(text) for form in forms):
             return None
         numbers.append(text)
     return numbers or None
 
 
-def _as_floats(column: pd.Series, marks: list[str]) -> pd.Series:
-    """Reads the numbers of a column, all of which have the mark or none."""
-    numbers = column
-    if marks == [","]:
-        numbers = column.map(
-            lambda cell: cell.replace(",", ".") if isinstance(cell, str) else cell,
-            na_action="ignore",
-        )
-    return pd.to_numeric(numbers, errors="coerce").astype(float)
+def _as_floats(column: pd.Series) -> pd.Series:
+    """Reads the numbers of a column, which have one decimal mark or none."""
+    numbers = column.map(
+        lambda cell: float(cell.replace(",", ".") if isinstance(cell, str) else cell),
+        na_action="ignore",
+    )
+    return numbers.astype(float)
 
 
-def _refuse(where: str, name: str, cells: _Cells, mark: str) -> None:
-    """Raises ``DataError`` of a column that rather has marks of thousands."""
+def _doubt(name: str, cells: _Cells, mark: str) -> str:
+    """Says of a column that it rather has marks of thousands."""
     first = cells.marked[0]
     beside = f" beside {cells.whole[0]!r}" if cells.whole else ""
     whole = first.replace(mark, "")
-    raise DataError(
-        f"{where}: column {name!r} holds {first!r}{beside}: is that {whole}, or has it "
+    return (
+        f"column {name!r} holds {first!r}{beside}: is that {whole}, or has it "
         f"a decimal {MARKS[mark]}? write numbers without marks of thousands, and all "
         "with one decimal mark"
     )

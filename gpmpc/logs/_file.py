@@ -1,6 +1,6 @@
 """Defines readers of log formats: options in, tables of numbers out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Protocol
@@ -25,6 +25,7 @@ MOST_COLUMNS = 4096  # of a table; with many more, pandas takes seconds for any
 
 FEWEST_IN_BLOCK = 5  # rows on average: blank lines part blocks of as many
 _BLOCKS_KEY = "blocks"  # in the ``attrs`` of a table
+_DOUBTS_KEY = "doubts"
 
 Tables = dict[str, pd.DataFrame]  # by topic; "" where a file has a single table
 
@@ -75,6 +76,18 @@ def begins_block(table: pd.DataFrame) -> np.ndarray:
     begins = table.attrs.get(_BLOCKS_KEY, ())
     blocks = np.searchsorted(begins, table.index.to_numpy(), side="right")
     return np.diff(blocks, prepend=blocks[:1]) > 0
+
+
+def with_doubts(table: pd.DataFrame, doubts: Mapping[str, str]) -> pd.DataFrame:
+    """Returns a table that knows why columns, by their names, are not to be read."""
+    table = table.copy(deep=False)
+    table.attrs = {**table.attrs, _DOUBTS_KEY: dict(doubts)}
+    return table
+
+
+def doubts_of(table: pd.DataFrame) -> dict[str, str]:
+    """Returns why columns of a table, by their names, are not to be read."""
+    return dict(table.attrs.get(_DOUBTS_KEY, {}))
 
 
 class LogFile(NamedTuple):

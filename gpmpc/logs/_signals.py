@@ -18,6 +18,7 @@ from gpmpc.exceptions import DataError
 from gpmpc.gp._wrapped import RADIANS, wrapped_columns
 from gpmpc.logs._columns import check_column
 from gpmpc.logs._dropouts import sentinels, zero_dropouts
+from gpmpc.logs._file import doubts_of
 from gpmpc.logs._findings import RunFindings
 from gpmpc.logs._mapping import Signal
 
@@ -38,9 +39,13 @@ def read_column(where: str, table: pd.DataFrame, column: str) -> Array:
         column: Its name.
 
     Raises:
-        DataError: The column is missing, or holds something else.
+        DataError: The column is missing, or holds something else, or what its numbers
+            mean is not sure.
     """
     check_column(where, table, column)
+    doubt = doubts_of(table).get(column, "")
+    if doubt:
+        raise DataError(f"{where}: {doubt}")
     values = table[column]
     if holds_times(table, column):
         return seconds(values)

@@ -78,6 +78,7 @@ WHOLE_AT_FIRST = TABLE.assign(
             x=[f"{x:.6g}".replace(".", ",") for x in TABLE["x"]]
         ),
         (1 + TABLE.abs()).map("{:.3f}".format).map(lambda text: text.replace(".", ",")),
+        TABLE.map("{:.6g}".format).assign(u=["0", "1e-3", *["11.120"] * 298]),
     ],
 )
 def test_decimal_commas_are_read_wherever_they_begin(tmp_path, table):
@@ -103,11 +104,17 @@ def test_decimal_commas_are_read_wherever_they_begin(tmp_path, table):
         ("0;950\n10;1.024\n", "point"),
     ],
 )
-def test_marks_of_thousands_are_refused(tmp_path, rows, mark):
+def test_marks_of_thousands_are_refused_where_they_are_read(tmp_path, rows, mark):
     delimiter = next(sign for sign in ";\t," if sign in rows)
     (tmp_path / "log.csv").write_text(f"t{delimiter}rpm\n{rows}")
-    with pytest.raises(DataError, match=f"column 'rpm' .*950.* a decimal {mark}.*thou"):
-        read_file(tmp_path / "log.csv")
+    reason = f"column 'rpm' .*950.* a decimal {mark}.*thou"
+    for runs in ({}, {"a": {"x": "rpm"}}):
+        columns = ["x"] if runs else ["rpm"]
+        mapping = {"time": "t", "states": {"x": columns}, "inputs": {"u": ["t"]}}
+        with pytest.raises(DataError, match=reason):
+            read_log(tmp_path / "log.csv", {**mapping, "runs": runs})
+    (finding,) = read_file(tmp_path / "log.csv").findings
+    assert finding.kind == "thousands"
 
 
 @pytest.mark.parametrize(
