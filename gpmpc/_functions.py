@@ -94,7 +94,8 @@ def call(key: str, function: Callable[..., Any], *arguments: Tensor) -> Any:
         advice = _advice(function, error)
         if advice is None:
             raise
-        raise SettingError(key, f"{_RULE}: {advice}, {_OTHERWISE}") from error
+        otherwise = _OTHERWISE_MODEL if key == "model" else _OTHERWISE
+        raise SettingError(key, f"{_RULE}: {advice}, {otherwise}") from error
     if torch.is_grad_enabled():
         _check_followed(key, function, value, arguments)
     return value

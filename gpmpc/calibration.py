@@ -54,6 +54,7 @@ from gpmpc.metrics import (
 )
 from gpmpc.models._past import (
     belief_of_measured,
+    knows_starts,
     measured_dim,
     measured_signals,
     rows_before,
@@ -282,7 +283,7 @@ def calibrate(
         ),
         width=deviation / rmse,
         independent=torch.tensor(independent),
-        noise=_noise_in_words(model, noise.moves_state, measurement_noise is not None),
+        noise=_noise_in_words(model, noise, has_variance=bool(deviation.any())),
     )
 
 
@@ -430,22 +431,28 @@ def _state_names(
     return tuple(known) or tuple(f"x{i + 1}" for i in range(measured_dim(model)))
 
 
-def _noise_in_words(
-    model: DynamicsModel, moves_the_state: bool, sensors_known: bool
-) -> str:
+def _noise_in_words(model: DynamicsModel, noise: _Noise, has_variance: bool) -> str:
     """Says which noise predicted intervals hold."""
+    sensors_known = noise.start is not None
+    if not has_variance:
+        return "no noise, as the model has none"
     if not model.noise_covariance.any():
-        sensors = (
-            ", the sensors' at the first step and the last" if sensors_known else ""
+        words = "what the model itself predicts at every step"
+        if sensors_known:
+            words += ", the sensors' at the first step and the last"
+    elif noise.moves_state and sensors_known:
+        words = (
+            "the model's noise at every step, the sensors' at the first and the last"
         )
-        return f"what the model itself predicts at every step{sensors}"
-    if moves_the_state and sensors_known:
-        return "the model's noise at every step, the sensors' at the first and the last"
-    if moves_the_state:
-        return "the model's noise at every step"
-    if sensors_known:
-        return "the sensors' noise at the first step and the last, none in between"
-    return "the model's noise at the last step alone, as if it were the sensors'"
+    elif noise.moves_state:
+        words = "the model's noise at every step"
+    elif sensors_known:
+        words = "the sensors' noise at the first step and the last, none in between"
+    else:
+        words = "the model's noise at the last step alone, as if it were the sensors'"
+    if not sensors_known and knows_starts(model):
+        words += ", and what the model knows of the sensors' at the first"
+    return words
 
 
 def _check(

@@ -13,7 +13,7 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import GPPosterior, Transitions
 from gpmpc.metrics import binomial_interval
-from gpmpc.models import DelayedModel
+from gpmpc.models import DelayedModel, KnownModel
 from gpmpc.plotting import calibration_figure
 from gpmpc.propagation import Linearization, MeanEquivalence
 
@@ -334,6 +334,8 @@ def test_the_noise_is_called_by_what_holds_it():
     for propagator in (Linearization(), varying):
         noise = calibrate(noiseless(), propagator=propagator, **arguments).noise
         assert noise == "what the model itself predicts at every step"
+    known = KnownModel(lambda x, u: x + u.sum(dim=-1, keepdim=True), 2, 1)
+    assert calibrate(known, **arguments).noise == "no noise, as the model has none"
 
 
 def test_misuse_is_refused_with_the_rule():

@@ -14,7 +14,7 @@ Two numbers tell such models apart, and each has several names:
   ``rows_before`` of any. ``rows_back`` of a ``Memory`` is its part of it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Protocol, TypeGuard
 
@@ -104,28 +104,38 @@ def has_past(model: Any) -> TypeGuard[ModelWithPast]:
     return measured is not None and measured < model.state_dim
 
 
-def start_covariance(model: Any, measured: Array | None = None) -> Array | None:
+def start_covariance(model: Any, measured: Array) -> Array | None:
     """Returns how uncertain states are that were measured once.
 
     Args:
-        model: Or one that it is around.
-        measured: The states that are measured (..., n); that of zeros by default.
+        model: Or one around it, of the same measured states.
+        measured: The states that are measured (..., n).
 
     Returns:
         The covariances (..., n, n); None where no model knows them.
     """
-    covariance_of = _start_covariance_of(model)
-    return None if covariance_of is None else covariance_of(measured)
+    if not knows_starts(model):
+        return None
+    return _model_that_knows_starts(model).start_covariance(measured)
 
 
-def _start_covariance_of(model: Any) -> Callable[[Array | None], Array] | None:
-    """Returns the ``start_covariance`` of a model, or of one that it is around."""
-    while model is not None:
-        own = getattr(model, "start_covariance", None)
-        if own is not None:
-            return own
+def knows_starts(model: Any) -> bool:
+    """Returns whether a model knows how uncertain states are that were measured once.
+
+    A disturbance that a filter estimates is not measured.
+    """
+    knowing = _model_that_knows_starts(model)
+    return knowing is not None and measured_dim(knowing) == measured_dim(model)
+
+
+def _model_that_knows_starts(model: Any) -> Any:
+    """Returns a model, or one that it is around, with a ``start_covariance``.
+
+    None where there is none.
+    """
+    while model is not None and not hasattr(model, "start_covariance"):
         model = getattr(model, "model", None)
-    return None
+    return model
 
 
 def variances_of_next_row(model: Any) -> Array | None:
@@ -141,8 +151,9 @@ def variances_of_next_row(model: Any) -> Array | None:
     if noise is None:
         return None
     variances = to_array(noise).diagonal().copy()
-    start = start_covariance(model)
-    if start is not None:
+    knowing = _model_that_knows_starts(model)
+    if knowing is not None:
+        start = knowing.start_covariance()
         variances[: len(start)] += start.diagonal()
     return variances
 
@@ -158,15 +169,14 @@ def as_measured(model: Any, belief: Gaussian, names: Sequence[str]) -> Gaussian:
         belief: Sorted by names where it has some.
         names: Of the states.
     """
-    covariance_of = _start_covariance_of(model)
-    if covariance_of is None or bool(belief.covariance.any()):
+    is_uncertain = bool(belief.covariance.any())
+    if not knows_starts(model) or is_uncertain:
         return belief
     belief = belief.in_order(names)
-    mean = to_array(belief.mean)
-    if len(mean) != measured_dim(model):
+    if belief.mean.shape[-1] != measured_dim(model):
         return belief
-    covariance = covariance_of(mean)
-    if not np.isfinite(covariance).all():
+    covariance = start_covariance(model, to_array(belief.mean))
+    if covariance is None or not np.isfinite(covariance).all():
         return belief
     return replace(belief, covariance=torch.from_numpy(covariance).to(belief.mean))
 

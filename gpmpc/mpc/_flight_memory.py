@@ -52,6 +52,9 @@ STATE_MEMORY = np.dtype(
         ("ratio", np.float64),  # their sum
         ("deviations", np.float64, BIAS_WINDOW),  # innovations over their deviations
         ("bias", np.float64),  # their sum
+        ("last_change", np.float64),  # of the innovation, when it was known
+        # share of changes against the last one, forgotten slowly; as long as it moves
+        ("turns", np.float64),
         ("change_count", np.int64),  # differences of successive innovations so far
         ("squared_changes", np.float64, CHANGES),  # their squares
         ("ordered_changes", np.float64, CHANGES),  # the same, from the smallest on

@@ -326,7 +326,7 @@ class Foresight:
         """Returns a flight with the gains of the regulator of its own stages.
 
         Outputs weigh as they do along it. Stages up to one at which the model has no
-        slopes are flown without feedback.
+        slopes are flown without feedback; all are where linearising fails.
         """
         no_gains = np.zeros((*flight.inputs.shape, flight.states.shape[1]))
         try:

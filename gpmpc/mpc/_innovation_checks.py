@@ -35,6 +35,8 @@ _UNSOLVED = 1e-7  # of a state's way, which a plan solved to a tolerance may mis
 _LAST_DIGITS = 1e-12  # of a number, which the arithmetic of a plan may lose
 _MEDIAN = 0.455  # of a chi-square of one degree
 _SUDDEN = 0.1  # deviations of its noise: a sensor that comes to rest moves less
+_SHARE = 0.1  # of the last step in the share of turns: ten are remembered
+_WHITE = 0.4  # share of turns above which innovations scatter: of noise it is 2/3
 
 
 @njit_noalloc
@@ -141,6 +143,10 @@ def _remember_change(state, innovation):
     is_known = change == change
     if is_known:
         _insert_change(state, change * change)
+        if state.measured != state.last_measured:
+            turns = change * state.last_change < 0.0
+            state.turns += _SHARE * (turns - state.turns)
+        state.last_change = change
     return is_known
 
 
@@ -198,7 +204,8 @@ def follow_sensors(memory):
                 state.is_coarse = 1.0
             state.repeats = 0.0
             state.missed_moves = 0.0
-            state.last_move = state.measured - state.last_measured
+            move = state.measured - state.last_measured
+            state.last_move = wrapped(move, state.is_angle)
             moving_sensors += 1
         state.last_measured = state.measured
     if memory.flight[0].steps_with_change < FEWEST_CHANGES:
@@ -230,11 +237,12 @@ def _was_to_change(state):
 def _stopped_at_once(state):
     """Whether a sensor showed noise until it showed the same.
 
-    A plant without noise comes to rest by ever smaller moves: all sensors then show the
-    same, which is no fault.
+    A plant without noise comes to rest by ever smaller moves, or at a hard stop: all
+    sensors then show the same, which is no fault. What its model misses changes the
+    innovations, too, but not to and fro as noise does.
     """
     is_sudden = abs(state.last_move) > _SUDDEN * math.sqrt(state.sensor_variance)
-    return _is_noisy(state) and is_sudden
+    return _is_noisy(state) and state.turns > _WHITE and is_sudden
 
 
 @njit_noalloc

@@ -31,7 +31,7 @@ from typing import Any, Literal, NamedTuple, NoReturn
 import numpy as np
 
 from gpmpc.exceptions import ShapeError, UnsupportedModel
-from gpmpc.models._past import variances_of_next_row
+from gpmpc.models._past import first_signals, variances_of_next_row
 from gpmpc.mpc import _flight_memory as memory
 from gpmpc.mpc._controller import Decision, model_of, steering_of
 from gpmpc.mpc._cost import Tracking
@@ -189,7 +189,7 @@ class FlightJudge:
         if holds_more:
             problem = _of_first_states(problem, state_dim)
         if names is None:
-            signals = signals_of(controller)
+            signals = first_signals(signals_of(controller), problem.state_dim)
             names = (signals.state_names, signals.input_names)
         noise = _learned_noise(controller)
         if noise is not None:  # of a model with a past more than what is measured
@@ -313,7 +313,8 @@ class FlightJudge:
 def _learned_noise(controller: Any) -> Array | None:
     """Returns the variances (n,) of the noise that a controller's model has learned.
 
-    They are zero where its plans hold them; None where there is no such model.
+    They hold what is not known of a measured start. All are zero where its plans hold
+    the noise; None where there is no such model.
     """
     prediction = getattr(steering_of(controller), "prediction", None)
     model = model_of(controller)
@@ -364,7 +365,8 @@ def _check_shape(name: str, got: tuple[int, ...], expected: tuple[int, ...]) -> 
 
 def _float64(values: Any) -> Array:
     """Returns values as a contiguous array of float64, without a copy if they are."""
-    return np.asarray(values, dtype=_FLOAT64, order="C")  # in a third of a look at it
+    # in a third of the time that looking at type and flags first would take
+    return np.asarray(values, dtype=_FLOAT64, order="C")
 
 
 _LOST = (memory.AWAY, memory.ESCAPING, memory.RISING)
@@ -387,7 +389,7 @@ _WORDS = {
     ),
     memory.STILL: (
         "{name} is measured the same for {value:.0f} steps, and so is every state, "
-        "without the noise that there was: no measurement is new"
+        "and they scattered before: no measurement is new"
     ),
     memory.PROMISE: "steps cost {value:.3g} times what the plans promised",
     memory.NOVELTY: (

@@ -255,9 +255,9 @@ class ControlLoop:
     initial one.
 
     Args:
-        controller: With a problem and an initial input. The problem is of what is
-            measured; of one of more states, such as a filter estimates, the first are
-            judged.
+        controller: With a problem and an initial input. All states that ``input`` is
+            told are judged, such as a disturbance of a filter's belief; where the
+            problem is of more, those that are told, the first ones.
         on_failure: ``"previous_plan"`` goes on along the last plan, ``"hold"`` keeps
             the last input, ``"raise"`` stops: what is applied then is not known here,
             and another flight takes a loop of its own.

@@ -12,15 +12,16 @@ from gpmpc.gaussian import Gaussian
 from gpmpc.logs import Log, LogMapping
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._noise import fit_noise, noise_steps
-from gpmpc.models import DelayedModel, LogDynamics, LogModel
+from gpmpc.models import DelayedModel, DisturbedModel, LogDynamics, LogModel
 from gpmpc.models._kinematics import Increments, RigidBodyKinematics
 from gpmpc.models._log_dynamics import OutputNoise, TubeNoise
 from gpmpc.models._parametric import AffineNominal, MultirotorNominal
 from gpmpc.models._quaternions import rotation_quaternion
 from gpmpc.models._state_space import StateGroup, StateSpace
-from gpmpc.mpc import GPMPC, Box, ControlLoop, Problem, Tracking
+from gpmpc.mpc import GPMPC, Box, ControlLoop, FlightJudge, Problem, Tracking
 from gpmpc.mpc._judgement import _learned_noise
 from gpmpc.propagation import Linearization
+from gpmpc.signals import Signals
 
 DT = 0.02
 ROWS = 2000
@@ -77,6 +78,7 @@ def test_a_tube_holds_held_out_rows(sensors, force, correlation, widest):
     (run,) = cart_log(1, sensors, force, correlation)
     recording = Recording(run.states, run.inputs[:-1])
     found = calibrate(dynamics, recording, Linearization(), 50, levels=(0.95,))
+    assert found.noise.endswith("what the model knows of the sensors' at the first")
     coverage = found.coverage[[0, 9, 49], :, 0].numpy()
     width = found.width[[0, 9, 49]].numpy()
     assert (coverage > 0.84).all(), coverage
@@ -138,6 +140,22 @@ def test_a_loop_begins_with_what_is_known_of_rows(delay):
     noise = _learned_noise(of_means)
     assert noise is not None
     np.testing.assert_allclose(noise[:2], start + DT**2, rtol=1e-6)
+
+
+def test_a_disturbance_beside_a_log_model_is_flown_with_and_judged():
+    model = with_tube(cart_model(), 1, np.array([4e-4, 9e-4]))
+    named = replace(model, signals=Signals(("x", "v"), ("u",)))
+    disturbed = DisturbedModel(named, torch.ones(2, 1).double(), [0.01])
+    problem = Problem(Tracking([10.0, 1.0, 0.0], [0.1]), Box([-3.0], [3.0]))
+    loop = ControlLoop(GPMPC(disturbed, Linearization(), problem, 3, [0.0]))
+    loop.input([0.5, 0.0, 0.1], np.zeros(3))  # as an observer estimates it
+    assert loop.last is not None
+    plan = loop.last.decision
+    assert plan is not None
+    assert not plan.covariances[0].any()
+    judge = FlightJudge.of(loop.controller, 2, 1)
+    judgement = judge.judge(np.zeros(2), np.zeros(2), plan)
+    assert judgement.level == "healthy"
 
 
 def test_a_conformal_tube_begins_with_what_is_known_of_rows():

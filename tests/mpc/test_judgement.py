@@ -700,6 +700,25 @@ def test_sensors_that_all_freeze_at_once_are_named(noise, n):
     assert ("no measurement is new" in judgement.reason) == (noise > 0.0)
 
 
+@pytest.mark.parametrize("turn", [0.0, 2.0 * np.pi])
+def test_a_plant_without_noise_may_stop_at_once(turn):
+    """At its hard stop, where the model misses both the stop and some of the way."""
+    angles = [0] if turn else []
+    judge = FlightJudge(Problem(Tracking([1.0], [0.01], angles=angles)))
+    plan = replace(plan_of(np.zeros(1)), covariances=np.zeros((6, 1, 1)))
+    state = np.ones(1)
+    stops_at = 3.2  # half a turn is 3.14
+    for k in range(80):
+        # a wheel shows less than half a turn, and is stopped behind it
+        shown = np.remainder(state + np.pi, turn) - np.pi if turn else state
+        move = 0.1 + 0.03 * np.sin(0.3 * k)
+        means = np.tile(shown + 0.1, (6, 1))
+        judgement = judge.judge(shown, np.zeros(1), replace(plan, means=means))
+        assert "no measurement is new" not in judgement.reason
+        state = np.minimum(state + move, stops_at)
+    assert state == stops_at
+
+
 @pytest.mark.parametrize(
     "cost",
     [
