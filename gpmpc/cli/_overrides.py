@@ -54,6 +54,13 @@ class Override:
         """Whether no result depends on it."""
         return is_shared(self.key)
 
+    @property
+    def is_word(self) -> bool:
+        """Whether it sets a word, such as a group's option, which has no parts."""
+        if self.key.startswith("~"):
+            return False
+        return isinstance(self.value, str) and "${" not in self.value
+
 
 @lru_cache(maxsize=10_000)
 def read_override(word: str) -> Override:
@@ -103,26 +110,30 @@ def choices(overrides: Iterable[str]) -> list[str]:
     Of a key given twice, the last counts. They are sorted, unless one changes a part
     of another: then a command needs their order.
     """
-    by_key: dict[str, str] = {}
+    by_key: dict[str, Override] = {}
     for word in overrides:
         override = read_override(word)
         if not override.is_aside:
             by_key.pop(override.key, None)  # it stands where it was given last
-            by_key[override.key] = override.choice
-    if _some_overlap(by_key):
-        return [*by_key.values()]
-    return sorted(by_key.values())
+            by_key[override.key] = override
+    own_choices = [override.choice for override in by_key.values()]
+    if _order_counts([*by_key.values()]):
+        return own_choices
+    return sorted(own_choices)
 
 
-def _some_overlap(keys: Iterable[str]) -> bool:
-    """Whether one of some settings is another one, or inside of it."""
-    names = [_name_of(key) for key in keys]
-    distinct = {*names}
-    if len(distinct) < len(names):
+def _order_counts(overrides: Sequence[Override]) -> bool:
+    """Whether one of some overrides changes what another one sets, or a part of it.
+
+    A value in a group whose option is chosen needs no order: Hydra takes groups first.
+    """
+    names = [override.name for override in overrides]
+    if len({*names}) < len(names):
         return True
+    with_parts = {override.name for override in overrides if not override.is_word}
     for name in names:
         *outer, _ = name.split(".")
-        if any(".".join(outer[: i + 1]) in distinct for i in range(len(outer))):
+        if any(".".join(outer[: i + 1]) in with_parts for i in range(len(outer))):
             return True
     return False
 

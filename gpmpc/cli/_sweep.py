@@ -477,7 +477,7 @@ def _write_plan(tree: Path, jobs: Sequence[Job], options: Sequence[str]) -> Path
     Equal sweeps write the same file, which is returned. ``options`` are those of the
     command by which its settings are found.
     """
-    content: dict[str, Any] = {"runs": [sorted(job.choices) for job in jobs]}
+    content: dict[str, Any] = {"runs": [[*job.choices] for job in jobs]}
     if options:
         content["search_options"] = shlex.join(options)
     plan = json.dumps(content, indent=1) + "\n"

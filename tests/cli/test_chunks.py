@@ -7,6 +7,7 @@ import os
 import re
 import threading
 from contextlib import suppress
+from dataclasses import replace
 from types import SimpleNamespace
 
 import hydra
@@ -20,7 +21,7 @@ from gpmpc.cli._examples import Examples
 from gpmpc.cli._overrides import choices, combinations
 from gpmpc.cli._run import RunToFly
 from gpmpc.cli._settings import model_file, settings_folders
-from gpmpc.cli._sweep import JobOutcome, Sweep, _end_of, _EndCounter
+from gpmpc.cli._sweep import JobOutcome, Sweep, _end_of, _EndCounter, _write_plan
 from gpmpc.exceptions import DataError, GpmpcError, SettingError
 from gpmpc.studies._index import RunIndex
 from gpmpc.studies._run_folder import (
@@ -324,8 +325,15 @@ def test_a_run_flown_elsewhere_with_other_settings_has_failed(
         (["p.m=2", "b=3", "p={m:1}"], ["p.m=2", "b=3", "p={m:1}"]),
         (["p.m=1", "p={m:1}", "p.m=2"], ["p={m:1}", "p.m=2"]),
         (["b=3", "++b=2"], ["b=3", "++b=2"]),
+        (["p=null", "++p.m=2"], ["p=null", "++p.m=2"]),
+        # A group's option needs no order: Hydra takes it first.
+        (["p=lqr", "p.m=2"], ["p.m=2", "p=lqr"]),
+        (["p.m=2", "p=lqr"], ["p.m=2", "p=lqr"]),
     ],
 )
-def test_choices_of_one_setting_keep_their_order(words, expected):
+def test_choices_of_one_setting_keep_their_order(words, expected, tmp_path):
     assert choices(words) == expected
     assert choices(next(combinations(words))) == expected
+    (job,) = jobs_of(tmp_path, "controller=lqr")
+    plan = _write_plan(tmp_path, [replace(job, choices=expected)], [])
+    assert json.loads(plan.read_text())["runs"] == [expected]
