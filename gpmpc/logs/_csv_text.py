@@ -113,7 +113,13 @@ def open_csv(where: str, file: io.BufferedReader) -> CsvText:
     rows = fields[first_row:]
     if delimiter == ",":
         _check_decimal_commas(where, fields[first_row - 1 : first_row], rows)
-    column_names = _find_names(head[:first_row], lines.comments, rows, delimiter)
+    column_names = _find_names(
+        head[:first_row],
+        lines.comments,
+        rows,
+        delimiter,
+        have_names=_are_numbered(rows) and head[first_row].lstrip().startswith('"'),
+    )
     columns = max([len(column_names.names), *map(len, rows)])
     decimal = _decimal_mark(rows)
     width = columns if delimiter == WHITE_SPACE else 0
@@ -318,6 +324,10 @@ def _first_row(lines: Sequence[Fields], delimiter: str) -> int:
         numeric and len(fields) == usual_width
         for fields, numeric in zip(lines, is_numeric, strict=True)
     ]
+    is_short = [
+        numeric and not whole
+        for numeric, whole in zip(is_numeric, is_whole, strict=True)
+    ]
     begins = [_is_text(lines[i][0]) for i, whole in enumerate(is_whole) if whole]
     begin_with_text = sum(begins) > len(begins) / 2
 
@@ -326,7 +336,9 @@ def _first_row(lines: Sequence[Fields], delimiter: str) -> int:
         if delimiter == WHITE_SPACE or not is_numeric[index]:
             return False
         if _is_text(lines[index][0]):
-            return begin_with_text and index + 1 < len(lines) and is_whole[index + 1]
+            while index + 1 < len(lines) and is_short[index]:
+                index += 1
+            return begin_with_text and is_whole[index]
         return True
 
     for index in range(len(lines)):
@@ -379,6 +391,7 @@ def _find_names(
     comments: Sequence[str],
     rows: Sequence[Fields],
     delimiter: str,
+    have_names: bool,
 ) -> _ColumnNames:
     """Finds the names of the columns before the rows.
 
@@ -387,6 +400,7 @@ def _find_names(
         comments: Those before the first line.
         rows: The first ones; where there is none, the first line has the names.
         delimiter: Of the rows.
+        have_names: Whether rows begin with their own names, as R writes them.
     """
     if not rows:
         return _ColumnNames(_split_line(lines[0], delimiter), units=[], skipped=0)
@@ -395,21 +409,24 @@ def _find_names(
         # other numbers than a mapping counts by
         return _ColumnNames([], units=[], skipped=len(lines))
     for separators in ((delimiter,), DELIMITERS):
-        names, units = _last_names(lines[-_NAME_LINES:], rows, separators)
+        names, units = _last_names(lines[-_NAME_LINES:], rows, separators, have_names)
         if names:
             understood = 2 if units else 1
             return _ColumnNames(names, units, skipped=len(lines) - understood)
-        names, units = _last_names(comments, rows, separators)
+        names, units = _last_names(comments, rows, separators, have_names)
         if names:
             return _ColumnNames(names, units, skipped=len(lines))
     return _ColumnNames([], units=[], skipped=len(lines))
 
 
 def _last_names(
-    lines: Sequence[str], rows: Sequence[Fields], separators: Sequence[str]
+    lines: Sequence[str],
+    rows: Sequence[Fields],
+    separators: Sequence[str],
+    have_names: bool,
 ) -> tuple[Fields, Fields]:
     """Returns the names in the last line that has some, and the units in one behind."""
-    candidates = [_split_names(line, rows, separators) for line in lines]
+    candidates = [_split_names(line, rows, separators, have_names) for line in lines]
     candidates = [names for names in candidates if names]
     if len(candidates) > 1 and _are_units(candidates[-1], candidates[-2]):
         units = [field.strip("[]() ") for field in candidates[-1]]
@@ -418,11 +435,12 @@ def _last_names(
 
 
 def _split_names(
-    line: str, rows: Sequence[Fields], separators: Sequence[str]
+    line: str, rows: Sequence[Fields], separators: Sequence[str], have_names: bool
 ) -> Fields:
     """Splits a line into as many names as rows have fields; none if it has others.
 
-    A name at the end may be empty, as may a cell.
+    A name at the end may be empty, as may a cell. R puts no name above those of its
+    rows, and all names in quotes.
     """
     widest = max(len(fields) for fields in rows)
     filled = max(_count_filled(fields) for fields in rows)
@@ -430,9 +448,9 @@ def _split_names(
         names = _split_line(line, separator)
         if _count_filled(names) <= widest and len(names) >= filled:
             return [] if _are_sentences(names, separator) else names
-        is_quoted = separator != WHITE_SPACE or '"' in line
-        if len(names) == filled - 1 and is_quoted and _are_numbered(rows):
-            return ["", *names]  # as R names its columns, and not those of the rows
+        is_one_less = len(names) == filled - 1 and line.lstrip().startswith('"')
+        if have_names and is_one_less and not _are_sentences(names, separator):
+            return ["", *names]
     if WHITE_SPACE in separators:  # names of several words
         names = [name.strip() for name in _WIDE_SPACE.split(line.strip())]
         return names if len(names) == widest else []

@@ -505,7 +505,7 @@ class LogMapping:
         if not isinstance(time, Mapping):
             time = {"column": _as_name(time)}
         _check_keys("time", time, ("column", "unit", "step"))
-        nominal = content.get("nominal")
+        nominal = content.get("nominal") or None
         settings = {key: content[key] for key in _PLAIN_KEYS if key in content}
         return cls(
             signals=tuple(signals),
@@ -523,11 +523,12 @@ class LogMapping:
 
 
 def _value_or(value: Any, default: Any) -> Any:
-    """Returns the value of a key, or a default where the key has none.
+    """Returns the value of a key, or a default where it is missing or empty.
 
     The number 0 is a value: somebody counts columns from it.
     """
-    return default if value is None else value
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return value if value or is_number else default
 
 
 def _as_name(column: Any) -> Any:

@@ -135,6 +135,6 @@ def _read_head(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> _DeclaredAr
             shape, _, dtype = np.lib.format.read_array_header_2_0(file)
         else:  # of structured arrays, which are no columns
             return _DeclaredArray(shape=(), dtype=np.dtype(object))
-    if len(shape) > 2:  # axes of length 1, as Simulink's signals have them
-        shape = tuple(length for length in shape if length != 1) or (1,)
+    if len(shape) > 2 and sum(length != 1 for length in shape) < 2:
+        shape = (math.prod(shape),)  # a signal of Simulink has axes of length 1
     return _DeclaredArray(shape=shape, dtype=dtype)

@@ -172,6 +172,7 @@ def test_a_last_line_without_an_end_is_left_out_and_said(tmp_path, missing):
         (b"\n\n# nothing\n", "no line with the names"),
         ("t,x,x\n0,1,2\n", r"column 'x' stands there 2 times: .* 'x \(column 3\)'"),
         ("0,1,2\n0,1,2\n", "column 't' is missing; it has 1, 2, 3"),
+        ("t,x,u\n1,5.5,2,OK\n2,5.5,2,OK\n", "column 't' is missing; it has 1, 2, 3, 4"),
         ("x\n1,5\n2,5\n", "is the comma the decimal mark too"),
         ("t x u\n0 1 2\n1 2\n", "row 2 has 2 fields, others 3"),
     ],
@@ -221,7 +222,8 @@ def test_counted_rows_behind_blank_lines_are_pieces(tmp_path, time, every):
 
 def test_a_column_may_be_called_by_a_hexadecimal_number(tmp_path):
     text = "time: t\nstates: {x: [0x1A]}\ninputs: {u: [010, 0b1, 10]}\nrate: 10"
-    (tmp_path / "map.yaml").write_text(text)
+    empty = "\ncontext: []\nnames: {}\nruns: []\nkeep: ''\nnominal: {}"
+    (tmp_path / "map.yaml").write_text(text + empty)
     mapping = LogMapping.load(tmp_path / "map.yaml")
     assert mapping.signal_columns == ("0x1A", "010", "0b1", "10")
     assert mapping.rate == 10
@@ -241,7 +243,8 @@ def test_any_number_of_settings_may_stand_before_the_rows(tmp_path, settings, da
 
 @pytest.mark.parametrize("delimiter", [" ", ",", "\t"])
 def test_rows_that_r_numbers_have_their_columns(tmp_path, delimiter):
-    text = TABLE.set_axis(TABLE.index + 1).to_csv(sep=delimiter, quoting=2)
+    numbers = [str(number) for number in TABLE.index + 1]
+    text = TABLE.set_axis(numbers).to_csv(sep=delimiter, quoting=2)
     (tmp_path / "log.csv").write_text(text.removeprefix(f'""{delimiter}'))
     file = read_file(tmp_path / "log.csv")
     np.testing.assert_array_equal(file.tables[""][["t", "x", "u"]], TABLE)
