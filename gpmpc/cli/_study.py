@@ -29,6 +29,7 @@ from gpmpc.studies.study import (
     TrialSpec,
     TrialStore,
     is_failed,
+    is_lost,
     run_study,
 )
 
@@ -52,14 +53,13 @@ def study(config: DictConfig) -> Result:
     }
     document = published.document(records)
     origin = {"Made by": json_text(meta).splitlines()}
-    ends = [
-        (trial, record)
-        for trial, record in zip(trials, records, strict=True)
-        if "error" in record
-    ]
-    failures = [
-        _line_of(trial, record, "failed") for trial, record in ends if is_failed(record)
-    ]
+    failures = []
+    losses = []
+    for trial, record in zip(trials, records, strict=True):
+        if is_failed(record):
+            failures.append(f"failed: {_line_of(trial, record)}")
+        elif is_lost(record):
+            losses.append(f"lost: {_line_of(trial, record)}")
     document = replace(
         document,
         code={**document.code, **origin},
@@ -71,30 +71,41 @@ def study(config: DictConfig) -> Result:
     written = write_files(folder, files)
     tables, notes = published.summary(records)
     console.print(terminal(tables, *notes))
-    word = "lost" if published.lost_is_result else "failed"
-    lines = [f"\n{written}"]
-    # Failures first: they are no results, and those that are may be many.
-    ends.sort(key=lambda end: not is_failed(end[1]))
-    lines += [_line_of(*end, word) for end in ends[:_SHOWN_ERRORS]]
-    if len(ends) > _SHOWN_ERRORS:
-        lines.append(f"{word}: {len(ends) - _SHOWN_ERRORS} more; see {folder}")
+    lines = [f"\n{written}", *_first_ends(failures, losses, folder)]
     if failures:
         lines.append(
-            f"{len(failures)} of {len(records)} trials failed and are in no number; "
+            f"failed, and in no number: {len(failures)} of {len(records)} trials; "
             "the same command runs them again"
         )
     console.out(*lines, sep="\n", highlight=False)
-    all_ended = len(ends) == len(records)
-    is_incomplete = bool(ends) and (all_ended or not published.lost_is_result)
-    code = 1 if failures or is_incomplete else 0
+    none_has_numbers = bool(records) and len(failures) + len(losses) == len(records)
+    lacks_a_result = bool(losses) and not published.lost_is_result
+    code = 1 if failures or lacks_a_result or none_has_numbers else 0
     return Result(data | {"folder": str(folder)}, code)
 
 
-def _line_of(trial: TrialSpec, record: Mapping[str, Any], word: str) -> str:
-    """Returns why a trial has no numbers, which ``word`` says unless it failed."""
+def _line_of(trial: TrialSpec, record: Mapping[str, Any]) -> str:
+    """Returns why a trial has no numbers."""
     labels = ", ".join(f"{key} {value}" for key, value in trial.labels.items())
-    word = "failed" if is_failed(record) else word
-    return f"{word}: {labels}: {record['error']}"
+    return f"{labels}: {record['error']}"
+
+
+def _first_ends(
+    failures: Sequence[str], losses: Sequence[str], folder: Path
+) -> list[str]:
+    """Returns the first lines of trials without numbers, and how many more there are.
+
+    Failures come first: they are no results, and losses, which are, may be many.
+    """
+    shown_failures = failures[:_SHOWN_ERRORS]
+    shown_losses = losses[: _SHOWN_ERRORS - len(shown_failures)]
+    lines = [*shown_failures, *shown_losses]
+    if len(failures) > len(shown_failures):
+        more = len(failures) - len(shown_failures)
+        lines.append(f"failed: {more} more; see {folder}")
+    if len(losses) > len(shown_losses):
+        lines.append(f"lost: {len(losses) - len(shown_losses)} more; see {folder}")
+    return lines
 
 
 # ``_main`` calls the function of the command's name.

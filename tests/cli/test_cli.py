@@ -2,9 +2,15 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
+import pandas as pd
 import pytest
+from omegaconf import OmegaConf
 
+from gpmpc.cli import _study
+from gpmpc.studies._document import Document
+from gpmpc.studies.study import TrialSpec
 from tests.cli.command import forked, gpmpc
 
 ROW = " ".join(str(i / 7) for i in range(15))
@@ -274,3 +280,38 @@ def test_the_traceback_is_there_for_who_asks(tmp_path):
     result = gpmpc("tables", "draws=0", "--debug", cwd=tmp_path)
     assert result.returncode != 0
     assert "Traceback" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("failed", "lost", "shown", "more"),
+    [
+        (1, 2, ["failed"] + 2 * ["lost"], []),
+        (12, 3, 10 * ["failed"], ["failed: 2 more", "lost: 3 more"]),
+        (8, 3, 8 * ["failed"] + 2 * ["lost"], ["lost: 1 more"]),
+    ],
+)
+def test_a_study_tells_failures_from_losses(
+    failed, lost, shown, more, tmp_path, monkeypatch, capsys
+):
+    records = [{"error": "Diverged"} for _ in range(lost)]
+    records += [{"error": "disk full", "is_result": False} for _ in range(failed)]
+    trials = [TrialSpec({"draw": i}, None, i, "") for i in range(len(records))]
+    published = SimpleNamespace(
+        name="tables",
+        trial_name="draws",
+        lost_is_result=False,
+        document=lambda records: Document("Tables", [], pd.DataFrame()),
+        summary=lambda records: ([], []),
+    )
+    monkeypatch.setattr(_study, "_study", lambda *_: published)
+    monkeypatch.setattr(_study, "_run_trials", lambda *_: (trials, records))
+    result = _study.study(OmegaConf.create({"folder": str(tmp_path)}))
+    said = capsys.readouterr().out.splitlines()
+    ends = [line for line in said if ": draw " in line]
+    assert [line.partition(":")[0] for line in ends] == shown
+    assert [line.partition(";")[0] for line in said if " more; " in line] == more
+    count = f"failed, and in no number: {failed} of {failed + lost} trials; "
+    assert said[-1].startswith(count)
+    document = (tmp_path / "tables.md").read_text()
+    assert document.count("failed: draw ") == failed
+    assert result.code == 1
