@@ -81,6 +81,7 @@ def named_columns(path: str | Path, tables: Tables, mapping: LogMapping) -> Tabl
         )
     names_in_file = list(table.columns)
     unit_by_name = said_units(table)
+    stated_units = units_of(table)  # without those that names say
     doubt_by_name = doubts_of(table)
     if mapping.names:
         others = table.columns[len(mapping.names) :]
@@ -97,8 +98,8 @@ def named_columns(path: str | Path, tables: Tables, mapping: LogMapping) -> Tabl
     for number, name in enumerate(names_in_file, start=1):
         unit = unit_by_name.get(name, "")
         is_time = number in numbers_of_times or table.columns[number - 1] in times
-        if is_time and not unit:
-            unit = unit_text_of_time(str(name))
+        if is_time:
+            unit = stated_units.get(name, "") or unit_text_of_time(str(name))
         units.append(unit)
     unit_of_column = dict(zip(table.columns, units, strict=True))
     unit_of_column |= {name: units[number - 1] for name, number in numbers.items()}

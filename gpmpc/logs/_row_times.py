@@ -19,10 +19,12 @@ from gpmpc.logs._signals import holds_times, read_column, seconds
 from gpmpc.logs._units import (
     NAMES_OF_TIMES,
     TIME_UNITS,
+    is_known,
     is_name_of_time,
     is_no_unit,
     unit_in_name,
     unit_of_time,
+    unit_said_of_time,
     unit_text_of_time,
     units_of,
 )
@@ -47,11 +49,11 @@ def time_unit(where: str, table: pd.DataFrame, column: str) -> str:
         column: Its name.
 
     Raises:
-        DataError: What the file says is no unit of times.
+        DataError: What the file says is a unit of another kind.
     """
     text = unit_text(table, column)
-    unit = unit_of_time(text)
-    if text and not unit:
+    unit = unit_said_of_time(text)
+    if not unit and text and is_known(text):
         raise DataError(
             f"{where}: the file says {text!r} of the unit of {column}, which is no "
             f"unit of times: in which is it? (time: {{column: {column}, unit: ms}}, "
@@ -111,7 +113,7 @@ def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array
 
     Raises:
         DataError: The column is missing, or holds something else, or its unit is
-            unknown, or rows are hours apart in a unit that nobody stated.
+            of another kind, or rows are hours apart in a unit that nobody stated.
     """
     dates = read_dates(table, column) if column in table else None
     if dates is not None:
@@ -159,7 +161,7 @@ def doubt_of_unit(table: pd.DataFrame, column: str, unit: str, times: Array) -> 
     They may where nobody stated one and they are whole numbers, as a counter of ms is.
     """
     is_number = pd.api.types.is_numeric_dtype(table[column])
-    is_stated = unit or unit_text(table, column) or not is_number
+    is_stated = unit or unit_said_of_time(unit_text(table, column)) or not is_number
     times = times[np.isfinite(times)]
     steps = np.abs(np.diff(times))
     if is_stated or not len(steps) or times.max() > EARLIEST_DATE:
@@ -190,8 +192,11 @@ def unit_of_clock(table: pd.DataFrame, column: str) -> str:
     is_clock = np.isfinite(clock).all() and (clock % 1 == 0).all()
     if len(clock) < 2 or not is_clock or (np.diff(clock) < 0).any():
         return ""
+    stamps = stamps[np.isfinite(stamps)]
+    if not len(stamps):
+        return ""
     elapsed = np.ptp(clock)
-    logged = np.ptp(stamps[np.isfinite(stamps)])
+    logged = np.ptp(stamps)
     for unit, factor in TIME_UNITS.items():
         if abs(elapsed * factor - logged) < _SAME_SPAN * logged:
             return unit

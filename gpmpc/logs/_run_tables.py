@@ -40,7 +40,7 @@ from gpmpc.logs._row_times import (
     unit_text,
 )
 from gpmpc.logs._signals import nan_zero_dropouts, read_column, read_signal
-from gpmpc.logs._units import conversion, is_known, unit_of_time, units_of
+from gpmpc.logs._units import conversion, is_known, unit_said_of_time, units_of
 
 MANY_REPEATS = 0.2  # of the rows that stay: stamps that are rounded repeat as often
 USUAL_GAP = 1.5  # time steps; a longer one is a gap where the mapping names none
@@ -284,7 +284,7 @@ def _note_unit_of_time(
     """
     doubt = doubt_of_unit(table, column, unit, times)
     findings.add("unit of the time", len(times) if doubt else 0, doubt)
-    said = unit_of_time(unit_text(table, column))
+    said = unit_said_of_time(unit_text(table, column))
     is_other = bool(unit and said and said != unit)
     text = f"the file says other units than the mapping: {column} in {said} (taken as "
     findings.add("unit", int(is_other), f"{text}{unit})")

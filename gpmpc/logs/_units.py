@@ -95,6 +95,8 @@ _SIGNS = {
     "\N{MICRO SIGN}": "u",
     "\N{GREEK SMALL LETTER MU}": "u",
 }
+_CAPITALS = {"S": "s", "MS": "ms"}  # units of times, where all is in capitals
+_SINCE = re.compile(r" (?:since|from|after) ")
 _NO_UNIT = ("", "1", "-")
 _UNITS_KEY = "units"  # in the ``attrs`` of a table
 # names of times that say their unit: "Time [ms]", "time (usec)", "t_s"; TimeUS is
@@ -159,6 +161,18 @@ def unit_of_time(text: str) -> str:
     return symbols if symbols in TIME_UNITS else ""
 
 
+def unit_said_of_time(text: str) -> str:
+    """Returns the unit of ``TIME_UNITS`` that a file says of a time; empty for none.
+
+    >>> unit_said_of_time("sec."), unit_said_of_time("ms since boot")
+    ('s', 'ms')
+    >>> unit_said_of_time("S"), unit_said_of_time("UTC")
+    ('s', '')
+    """
+    word = _SINCE.split(text.strip(), maxsplit=1)[0].rstrip(".")
+    return unit_of_time(_CAPITALS.get(word, word))
+
+
 def is_name_of_time(name: str) -> bool:
     """Tells whether a column is called as times are; T is rather a temperature."""
     return name == "t" or (len(name) > 1 and name.casefold() in NAMES_OF_TIMES)
@@ -193,7 +207,7 @@ def unit_in_name(column: str) -> str:
 def unit_text_of_time(time: str) -> str:
     """Returns what the name of a time says of its unit, as it is written there.
 
-    In brackets that may be any word.
+    In brackets that may be any word, but for a letter, as of a channel: (A).
 
     >>> unit_text_of_time("elapsed (msec)"), unit_text_of_time("time_boot_ms")
     ('msec', 'ms')
@@ -202,7 +216,8 @@ def unit_text_of_time(time: str) -> str:
     """
     if time in _TIMES_BY_NAME:
         return _TIMES_BY_NAME[time]
-    if text := _text_in_brackets(time):
+    text = _text_in_brackets(time)
+    if text and (len(text) > 1 or unit_said_of_time(text)):
         return text
     match = _ENDS_WITH_UNIT.fullmatch(time)
     is_unit = match is not None and match[1] != "d" and unit_of_time(match[1])

@@ -386,6 +386,9 @@ SIGNALS = {"states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
         ("elapsed (microseconds),x,u\n", {"time": 1, **SIGNALS}, 20e-6),
         ("time [min],x,u\n", {"time": 1, **SIGNALS}, 1200),
         ("t,x,u\nh,m,N\n", {"time": "t", **SIGNALS}, 72_000),
+        ("Time (sec.),x,u\n", {"time": 1, **SIGNALS}, 20),
+        ("t [S],x,u\n", {"time": 1, **SIGNALS}, 20),
+        ("t (ms since start),x,u\n", {"time": 1, **SIGNALS}, 0.02),
         ("t,x,u\n", {"time": {"column": "t", "unit": "d"}, **SIGNALS}, 1_728_000),
     ],
 )
@@ -402,7 +405,16 @@ def test_the_unit_that_a_file_says_of_its_times_is_taken(
         assert inspection.streams["rate [Hz]"][0] == pytest.approx(1 / step)
 
 
-@pytest.mark.parametrize("header", ["time (left),x,u\n", "t,x,u\nV,m,N\n"])
+@pytest.mark.parametrize("name", ["Time (UTC)", "time (left)", "t (rel)", "Time (A)"])
+def test_a_word_in_brackets_is_no_unit_of_times(tmp_path, name):
+    rows = [f"{0.02 * k},{k % 7},{k % 3}\n" for k in range(60)]
+    (tmp_path / "a.csv").write_text(f"{name},x,u\n" + "".join(rows))
+    for column in (name, 1):
+        log = read_log(tmp_path / "a.csv", {"time": column, **SIGNALS})
+        assert log.time_step == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("header", ["time [km/h],x,u\n", "t,x,u\nV,m,N\n"])
 def test_what_is_no_unit_of_times_is_asked_for(tmp_path, header):
     rows = [f"{0.02 * k},{k % 7},{k % 3}\n" for k in range(60)]
     (tmp_path / "a.csv").write_text(header + "".join(rows))
