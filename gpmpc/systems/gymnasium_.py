@@ -90,13 +90,15 @@ class _Environment(Simulator):
         """
         inner = self.environment.unwrapped
         model: Any = getattr(inner, "model", None)
+        data: Any = getattr(inner, "data", None)
         if (
             self._observe is not None
             or not hasattr(inner, "set_state")
+            or model is None
+            or data is None
             or len(state) != model.nq + model.nv
         ):
             return False
-        data: Any = getattr(inner, "data", None)
         physics = np.concatenate([data.qpos, data.qvel])
         if self._now is None or not np.array_equal(physics, self._now):
             return False

@@ -281,6 +281,18 @@ def test_misuse_of_simulators_is_one_clear_line(cart, tmp_path, monkeypatch):
         def step(self, action):
             return {"a": action}, 0.0, False, False, {}
 
+    class Settable(Worded):  # and no MuJoCo behind it
+        observation_space = Worded.action_space
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(1), {}
+
+        def set_state(self, positions, velocities):
+            raise NotImplementedError
+
+    settable = gymnasium_system(Settable(), time_step=0.1)
+    with pytest.raises(SettingError, match="cannot be set to a state"):
+        step(settable, np.ones(1), np.zeros(1))
     named = gymnasium_system(
         Worded(), observe=lambda observation: observation["a"], time_step=0.1
     )
