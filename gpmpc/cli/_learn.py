@@ -576,22 +576,30 @@ def _facts(
     ]
 
 
-def _tube_in_words(judgement: Judgement) -> str:
+def _tube_in_words(learned: IdentifiedModel, judgement: Judgement) -> str:
     """Says how far a controller's tube may be trusted, by the steps ahead."""
-    sentences = []
+    text = (
+        "A controller's tube is of white noise and an uncertain first row, both fitted "
+        "to held-out rollouts; the intervals that were judged follow the errors of the "
+        "run"
+    )
+    noise = learned.noise
+    correlated = noise.outputs[np.array(noise.time_constants) > 0]
+    if correlated.any():
+        text += " and hold errors that are alike for several rows"
+    by_step = []
     for step, coverage, width in zip(
         judgement.steps, judgement.tube_coverage, judgement.tube_width, strict=True
     ):
-        sentences.append(
-            f"{step} steps ahead it holds {_range(coverage, '.0%')} of them, "
-            f"{_range(width, '.2f')} as wide as they are"
+        steps = "1 step" if step == 1 else f"{step} steps"
+        by_step.append(
+            f"{_range(coverage, '.0%')} of the errors {steps} ahead, and is "
+            f"{_range(width, '.2f')} times as wide as they are"
         )
+    groups = " (smallest to largest of the groups)" if len(judgement.groups) > 1 else ""
     return (
-        "The intervals that were judged begin at an estimated state, hold errors that "
-        "are alike for several rows, and follow those of the run. A controller's tube "
-        "does not: white noise and an uncertain first row stand for all errors, as "
-        f"held-out rollouts make likely. Of {judgement.level:.0%}, on these rows: "
-        f"{'; '.join(sentences)} (from the groups' worst to best)."
+        f"{text}. On these rows, a tube of {judgement.level:.0%} holds "
+        f"{'; '.join(by_step)}{groups}."
     )
 
 
@@ -649,7 +657,7 @@ def _doubts(
             "and errors are smaller than those of a forecast made before."
         )
     if judgement.tube_width.size and not learned.model.feedback_outputs:
-        doubts.append(_tube_in_words(judgement))
+        doubts.append(_tube_in_words(learned, judgement))
     doubts.append("Outside the ranges of the data (table above) nothing was seen.")
     doubts += _doubts_of_what_stays(learned, train)
     if learned.model.feedback_outputs:

@@ -315,8 +315,16 @@ def test_a_model_that_loses_to_a_baseline_is_called_so():
     (sentence,) = [one for one in doubts if "A controller's tube" in one]
     coverage = judgement.tube_coverage[1]
     width = judgement.tube_width[1]
-    assert f"50 steps ahead it holds {coverage.min():.0%}" in sentence
-    assert f" to {width.max():.2f} as wide as they are (from" in sentence
+    assert f" a tube of {judgement.level:.0%} holds " in sentence
+    assert " of the errors 1 step ahead, and is " in sentence
+    assert f"{coverage.max():.0%} of the errors 50 steps ahead" in sentence
+    assert f" to {width.max():.2f} times as wide as they are (smallest to" in sentence
+    assert "alike for several rows" in sentence
+    is_white = np.array(learned.noise.time_constants) == 0
+    outputs = learned.noise.outputs * is_white[:, np.newaxis]
+    white = replace(learned, noise=replace(learned.noise, outputs=outputs))
+    words = " ".join(_doubts(white, judgement, pieces, train))
+    assert "alike for several rows" not in words
     assert any("knows the inputs to come" in one for one in doubts)
     terms = replace(learned.model, weights=np.ones((2, 3)), without_nominal=(0,))
     first, last = outputs_in_words(replace(learned, model=terms))
