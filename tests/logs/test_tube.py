@@ -142,7 +142,7 @@ def test_a_loop_begins_with_what_is_known_of_rows(delay):
     np.testing.assert_allclose(noise[:2], start + DT**2, rtol=1e-6)
 
 
-def test_a_disturbance_beside_a_log_model_is_flown_with_and_judged():
+def test_a_disturbance_beside_a_log_model_is_flown_and_judged():
     model = with_tube(cart_model(), 1, np.array([4e-4, 9e-4]))
     named = replace(model, signals=Signals(("x", "v"), ("u",)))
     disturbed = DisturbedModel(named, torch.ones(2, 1).double(), [0.01])
