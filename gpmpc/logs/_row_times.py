@@ -80,7 +80,8 @@ def _units_but(unit: str) -> str:
 def usual_time_column(table: pd.DataFrame) -> str:
     """Finds a column that is called as times are, or holds dates; empty without one.
 
-    A date that is the same in all rows, as of when the file was made, is no time.
+    A date that is the same in all rows, as of when the file was made, is no time; nor
+    are texts that are the same in most, as the day of a session.
     """
     columns = [str(name) for name in table]
     for time in TIMES:
@@ -90,15 +91,16 @@ def usual_time_column(table: pd.DataFrame) -> str:
     for name in columns:
         if unit_in_name(name):
             return name
-    dates = (str(name) for name in table if _begins_with_dates(table, name))
-    return next((name for name in dates if table[name].nunique() > 1), "")
+    return next((str(name) for name in table if _holds_dates(table, name)), "")
 
 
-def _begins_with_dates(table: pd.DataFrame, column: str) -> bool:
-    """Tells whether a column holds dates, also as texts in its first rows."""
+def _holds_dates(table: pd.DataFrame, column: str) -> bool:
+    """Tells whether a column holds different dates, also as texts in its rows."""
     if holds_times(table, column):
-        return True
-    return read_dates(table.head(_SAMPLE), column) is not None
+        return table[column].nunique() > 1
+    if read_dates(table.head(_SAMPLE), column) is None:
+        return False
+    return table[column].nunique() > len(table) / 2
 
 
 def read_times(where: str, table: pd.DataFrame, column: str, unit: str) -> Array:
@@ -270,7 +272,8 @@ def row_times(where: str, table: pd.DataFrame, mapping: LogMapping) -> Array | N
         if isinstance(mapping.time_step, str):
             unit = unit or time_unit(where, table, mapping.time_step)
         return _steps_from_first(table) * step * TIME_UNITS[unit or "s"]
-    return _steps_from_first(table) / (mapping.rate or 1.0)
+    assert mapping.rate is not None  # of rows that are counted without a step
+    return _steps_from_first(table) / mapping.rate
 
 
 def counts_rows(table: pd.DataFrame, mapping: LogMapping) -> bool:

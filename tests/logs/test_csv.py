@@ -241,6 +241,12 @@ def test_any_number_of_settings_may_stand_before_the_rows(tmp_path, settings, da
     assert (finding.kind, finding.count) == ("lines before the rows", settings)
 
 
+def test_rows_that_begin_with_a_text_may_be_short(tmp_path):
+    text = "a,1\na,2\n" + "".join(f"a,{k},{k % 7}\n" for k in range(60))
+    (tmp_path / "log.csv").write_text(text)
+    assert len(read_file(tmp_path / "log.csv").tables[""]) == 62
+
+
 @pytest.mark.parametrize("delimiter", [" ", ",", "\t"])
 def test_rows_that_r_numbers_have_their_columns(tmp_path, delimiter):
     numbers = [str(number) for number in TABLE.index + 1]

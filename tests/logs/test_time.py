@@ -355,6 +355,7 @@ def test_a_rate_counts_no_rows_beside_a_column_of_times(tmp_path, name):
 def test_the_date_of_a_file_is_no_time_of_its_rows(tmp_path):
     table = strange.pendulum(ROWS).drop(columns="t")
     table["made"] = pandas.Timestamp("2024-05-01 12:00")
+    table["day"] = ["2024-05-01"] * 300 + ["2024-05-02"] * (ROWS - 300)
     table.to_parquet(tmp_path / "arm.parquet")
     signals = {key: TABLE_MAPPING[key] for key in ("states", "inputs")}
     log = read_log(tmp_path / "arm.parquet", {**signals, "rate": 50})
