@@ -33,7 +33,8 @@ class Stamps(NamedTuple):
     rows: np.ndarray  # (K,) of the table, those that are used
     time: Array  # (K,) [s]
     #: (K,) whether time does not go on from the row before: it ran backwards, the
-    #: clock began anew, or nobody knows
+    #: clock began anew, a block of counted rows ended, or how much time passed is not
+    #: known
     starts_piece: np.ndarray
     repeated: int
     backwards: int  # rows that are left out because a later stamp stood before

@@ -32,7 +32,7 @@ class Grid(NamedTuple):
     """Times (G,) [s] at which a run has rows, and where its pieces begin."""
 
     time: Array
-    breaks: np.ndarray  # (G,) rows before which time ran backwards, or jumped
+    breaks: np.ndarray  # (G,) rows that do not go on from the one before
 
 
 def grid_of_rows(
@@ -128,7 +128,7 @@ def common_pieces(
 
 
 def cut_pieces(stamps: Stamps, max_gap: float | None) -> Array:
-    """Returns begins and ends (P, 2) [s] of the pieces between jumps and reversals."""
+    """Returns begins and ends (P, 2) [s] of the pieces of a run."""
     time = stamps.time
     first_rows = np.flatnonzero(_begins_piece(stamps, max_gap))
     begins = time[np.r_[0, first_rows]]
@@ -137,7 +137,7 @@ def cut_pieces(stamps: Stamps, max_gap: float | None) -> Array:
 
 
 def _begins_piece(stamps: Stamps, max_gap: float | None) -> np.ndarray:
-    """Tells before which rows (K,) time ran backwards, or jumped."""
+    """Tells before which rows (K,) time jumped, or does not go on (``Stamps``)."""
     begins = stamps.starts_piece.copy()
     begins[find_jumps(stamps.time, max_gap) + 1] = True
     return begins

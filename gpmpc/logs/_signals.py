@@ -220,7 +220,7 @@ def _note_undeclared_angles(
         after = values[rows, column][:, None]
         before = values[rows - 1, column][:, None]
         # whole numbers from 0 to 6 are no radians
-        is_counter = not (values[behind, column] % 1).any()
+        is_counter = not (values[rows, column] % 1).any()
         for wrapped in wrapped_columns(before, after):
             if is_counter and wrapped.turn == RADIANS:
                 continue

@@ -218,7 +218,8 @@ class LogDynamics:
     def noise_covariance(self) -> Tensor:
         """Covariance of the next state's noise at the state of zeros (n, n).
 
-        The sensors' noise is no part of it: see ``start_covariance``.
+        The sensors' noise is no part of it (see ``start_covariance``), except in files
+        without a tube's noise, as earlier releases wrote them.
         """
         return self._noise_at_origin
 
