@@ -22,7 +22,7 @@ of one state at a time, steps without a measurement, and a second in which all o
 are frozen, or positions are in another unit. RMSE over the same steps, without and with
 online learning; "sound" is the ratio to online learning in the same air with sound
 sensors. Without learning the controller acts on a wrong measurement, and what that
-costs stands in the columns "as learned"; with it, one in doubt is not acted on.
+costs stands in the columns "as learned"; with it, a sensor in doubt is not acted on.
 """
 
 import argparse

@@ -28,8 +28,9 @@ class OnlineLearning:
     window: int = 20  #: steps over which predictions are compared
     #: lead of the summed log densities from which on the change is used
     margin: float = 20.0
-    #: squared error of an output over its expectation, from which on a step is in doubt
-    surprise: float = 30.0
+    #: squared error of a sensor over its noise variance, at which it may as well be
+    #: wrong as right
+    surprise: float = 24.0
 
     def __post_init__(self) -> None:
         SlidingWindow(self.points, self.remove)  # checks both

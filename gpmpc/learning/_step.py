@@ -1,36 +1,49 @@
-"""One step of online learning: is it learned, put in doubt, or does it end a doubt?
+"""One step of online learning: how the explanations of a flight go on.
 
-The package's text describes the procedure.
+The package's text describes the method.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from gpmpc._angles import state_difference
+from gpmpc._arrays import is_measured
 from gpmpc._calls import explains_arguments
 from gpmpc._dynamics import Array
-from gpmpc.learning._changed_model import ChangedModel, Comparison, ObservedChange
-from gpmpc.learning._innovation import LARGEST_LEAD, Innovation, LearningStep
-from gpmpc.learning._state import Doubt, Expectation, LearningState, NewPlant
+from gpmpc.learning._changed_model import ChangedModel
+from gpmpc.learning._continuations import (
+    QUIET,
+    Continuation,
+    Forecast,
+    continuations,
+    forecast,
+    is_settling,
+)
+from gpmpc.learning._innovation import LearningStep
+from gpmpc.learning._state import Expectation, Explanation, LearningState
 
 # Differences of errors that say how large the noise is: at least, and at most.
 _FEWEST_RATIOS = 3
 _MOST_RATIOS = 100
-# Deviations of the noise from which on an error is no measurement: an invalid one, as
-# sensors mark it. Of such numbers even the squares are none.
-_ABSURD = 1e50
-_MISALIGNED = 0.1  # part of errors that no input explains, in deviations, at most
-# Where acting on a measurement is at stake, not a model: squared errors of outputs that
-# err, at least, and what no input explains, at most.
-_NOTABLE = 9.0
-_DEVIATIONS = 3.0
-_MOST_CONFIRMATIONS = 1e6  # for the size of an error
-_LONGEST_BRIDGE = 2  # steps in doubt whose measurement is not acted on, at most
-_PATIENCE = 2  # further confirmations for steps that nothing explained, at most
+# Those that tell, of all outputs together, whether noise has just grown; and by how
+# much it may.
+_LATEST_RATIOS = 9
+_NOTABLE_RATIO = 2.0
+_LARGEST_RATIO = 1e4
+# Differences of which the median is taken, at least: those that are not known yet count
+# as of the model's own noise, since one sensor may be wrong from the beginning.
+_FEWEST_OF_MEDIAN = 16
+_CHI2_MEDIAN = float(chi2.median(1))
+_MOST_EXPLANATIONS = 8
+_LARGEST_LEAD = 20.0  # of the heaviest explanation's log weight, over those kept
+# Steps for which a lighter explanation may agree with the heaviest on the state.
+_PATIENCE = 5
+# Noise variance of what is only predicted, in variances of the prediction.
+_UNTAUGHT = 1e6
 
 
 @explains_arguments
@@ -44,533 +57,208 @@ def learn_from_step(
         input: Applied in the step (m,).
         measured: State measured after it (n,).
     """
-    model = before.model
     # Arrays of their own: callers may reuse theirs.
     input = np.array(input, dtype=float)
     measured = np.array(measured, dtype=float)
-    observed = model.observe(before.state, input, measured)
-    if not (np.abs(observed.value) < _ABSURD * np.sqrt(model.gp_noise)).all():
-        if before.doubt is None:
-            return before.after_gap(measured)
-        return _resolve_outside_model(before, before.doubt, input, measured, observed)
-    noise_ratios = _with_noise_ratio(before, observed.value)
-    learning_state = before.with_measurement(measured, observed.value, noise_ratios)
-    if len(noise_ratios) < _FEWEST_RATIOS:
-        return learning_state.later()
+    forecasts = [forecast(one, input) for one in before.explanations]
+    predicted = forecasts[0]
+    if not is_measured(measured).all() or not predicted.is_finite:
+        return before.after_gap(measured)
+
+    model = before.model
+    error = state_difference(measured, predicted.mean, model.angles)
+    observed_change = model.B_inverse @ error
+    after = replace(
+        before,
+        state=measured,
+        observed_change=observed_change,
+        noise_ratios=_with_noise_ratio(before, observed_change),
+        has_failed=False,
+    )
+    if len(after.noise_ratios) < _FEWEST_RATIOS:
+        return after.with_explanations((before.heaviest.believing(measured),))
     step = LearningStep(
         state=before.state,
         input=input,
         next_state=measured,
-        point=observed.point,
-        observed_change=observed.value,
-        latent_variance=observed.latent_variance,
-        noise_variance=_noise_variance(noise_ratios, model),
+        point=predicted.point,
+        observed_change=observed_change,
+        latent_variance=model.explainable_variance(predicted.latent),
+        noise_variance=_noise_variance(after.noise_ratios, model),
     )
-    comparison = model.predict_then_learn(step)
-    if before.doubt is not None:
-        # It is that of ``learning_state`` as well, and not None here.
-        try:
-            return _resolve_doubt(learning_state, step, comparison, before.doubt)
-        except np.linalg.LinAlgError:  # the model has a mean there, and no slope
-            return _resolve_outside_model(
-                before, before.doubt, input, measured, observed
-            )
-    innovation = comparison.planned(before.active)
-    # What is no number is surprising, too.
-    surprising = not innovation.largest_square <= model.learning.surprise
-    if not surprising and not step.repeats.all():
-        return _accept(learning_state, comparison)
-    expected = learning_state.expect(Expectation.certain(before.state, model), step)
-    if surprising or _is_frozen(learning_state, step, expected):
-        return _put_in_doubt(
-            learning_state,
-            step,
-            comparison,
-            expected_if_wrong=expected,
-            trusted_noise_ratios=before.noise_ratios,
-        )
-    return learning_state.later()
+    if len(before.explanations) == 1:
+        ordinary = _ordinary_step(before.heaviest, step)
+        if ordinary is not None:
+            return after.with_explanations((ordinary,))
+
+    candidates: list[Continuation] = []
+    for explanation, of_explanation in zip(before.explanations, forecasts, strict=True):
+        if of_explanation.is_finite:
+            candidates += continuations(explanation, of_explanation, step)
+    heaviest, *others = _heaviest(candidates)
+    explanations = [_continued(heaviest, heaviest, step)]
+    for other in others:
+        explanation = _continued(other, heaviest, step)
+        if explanation.agreed_steps <= _PATIENCE:
+            explanations.append(explanation)
+    return after.with_explanations(tuple(explanations))
 
 
 def _with_noise_ratio(before: LearningState, observed_change: Array) -> Array:
-    """Returns the noise ratios (w,) with the one of a further observed change (k,)."""
-    squares = (observed_change - before.observed_change) ** 2 / before.model.gp_noise
-    ratio = float(squares.mean()) / 2.0
-    if not np.isfinite(ratio):
+    """Returns the noise ratios (w, k) with those of a further observed change (k,)."""
+    difference = observed_change - before.observed_change
+    ratio = difference**2 / (2.0 * before.model.gp_noise)
+    if not np.isfinite(ratio).all():
         return before.noise_ratios
-    return np.append(before.noise_ratios, ratio)[-_MOST_RATIOS:]
+    return np.vstack([before.noise_ratios, ratio])[-_MOST_RATIOS:]
 
 
 def _noise_variance(noise_ratios: Array, model: ChangedModel) -> Array:
     """Returns the noise (k,) of the model, or of the last steps where that is more.
 
-    What changes slowly has no part in differences of successive errors, and a jump no
-    weight in their median.
-    """
-    noise = model.gp_noise
-    outputs = len(noise)
-    median = float(np.sort(noise_ratios)[len(noise_ratios) // 2])
-    return noise * max(1.0, median * outputs / _chi2_median(outputs))
-
-
-@cache
-def _chi2_median(degrees: int) -> float:
-    return float(chi2.median(degrees))
-
-
-def _accept(learning_state: LearningState, comparison: Comparison) -> LearningState:
-    """Makes a step a point of the change, and decides whether the change is used."""
-    unexplained_steps = max(0, learning_state.unexplained_steps - 1)
-    learned = replace(
-        learning_state,
-        model=comparison.model_with_step,
-        unexplained_steps=unexplained_steps,
-    )
-    return _count_lead(learned, comparison.lead)
-
-
-def _count_lead(learning_state: LearningState, lead: float) -> LearningState:
-    """Decides whether the change is used, by its lead over the last steps."""
-    settings = learning_state.model.learning
-    leads = np.append(learning_state.leads, lead)[-settings.window :]
-    total = float(leads.sum())
-    active = total >= 0 if learning_state.active else total > settings.margin
-    version = learning_state.version + (active or learning_state.active)
-    return replace(learning_state, leads=leads, active=active, version=version).later()
-
-
-def _count_doubtful_lead(learning_state: LearningState, lead: float) -> LearningState:
-    """Counts a step in doubt, which may end the use of a change but not begin it."""
-    return (
-        _count_lead(learning_state, lead)
-        if learning_state.active
-        else learning_state.later()
-    )
-
-
-def _put_in_doubt(
-    learning_state: LearningState,
-    step: LearningStep,
-    comparison: Comparison,
-    expected_if_wrong: Expectation,
-    trusted_noise_ratios: Array,
-    bounded_density_to_beat: float = 0.0,
-) -> LearningState:
-    """Holds a measurement back that no prediction explains.
+    What changes slowly has no part in differences of successive errors, and a sensor
+    that is wrong now and then no weight in their median.
 
     Args:
-        learning_state: With the measurement.
-        step: The step that led to it.
-        comparison: Of the predictions of the step.
-        expected_if_wrong: Where the plant is if all measurements in doubt are wrong.
-        trusted_noise_ratios: Those before the steps in doubt.
-        bounded_density_to_beat: What the bounded log density of a plant that the
-            measurement before has put forward must exceed, for it to be tried.
+        noise_ratios: Of the last steps (w, k).
+        model: With the noise of its data.
     """
-    trusted = _trusted_sensors(step, expected_if_wrong, learning_state.model)
-    previous_doubt = learning_state.doubt  # that the measurement did not resolve
-    unexplained_steps = learning_state.unexplained_steps
-    steps_in_doubt = 1
-    starts = [Expectation.certain(step.state, learning_state.model)]
-    continued_plants: tuple[NewPlant, ...] = ()
-    if previous_doubt is not None:
-        if (trusted | previous_doubt.trusted).all():
-            # The sensors that were wrong are right again: they were for one step.
-            learning_state = learning_state.without_doubt(previous_doubt)
-            starts = [_begun_now(previous_doubt.expected)]
-        else:
-            unexplained_steps = min(learning_state.unexplained_steps + 1, _PATIENCE)
-            steps_in_doubt = previous_doubt.steps_in_doubt + 1
-            continued_plants = _without_last_measurement(
-                previous_doubt.new_plants, step, bounded_density_to_beat
-            )
-            if previous_doubt.bridged:
-                # The change begins with this step, or with the first in doubt.
-                starts.append(_begun_now(previous_doubt.expected))
-                starts.append(previous_doubt.expected)
-
-    acts_like_input = _acts_like_input(
-        innovation=learning_state.innovation(expected_if_wrong),
-        by_input=learning_state.model.B_inverse @ expected_if_wrong.by_input,
-        notable=_NOTABLE,
-        deviations=_DEVIATIONS,
-    )
-    bridged = steps_in_doubt <= _LONGEST_BRIDGE and not acts_like_input
-    new_plants: tuple[NewPlant, ...] = ()
-    if not _is_frozen(learning_state, step, expected_if_wrong):
-        new_plants = tuple(
-            _new_plant(
-                learning_state,
-                step,
-                start,
-                unexplained_steps,
-                steps_in_doubt,
-                may_be_tried=acts_like_input,
-            )
-            for start in starts
-        )
-        new_plants += continued_plants
-    doubt = Doubt(
-        expected=expected_if_wrong.conditioned_on(
-            learning_state.state, trusted, learning_state.model
-        ),
-        trusted=trusted,
-        trusted_noise_ratios=trusted_noise_ratios,
-        new_plants=new_plants,
-        steps_in_doubt=steps_in_doubt,
-        bridged=bridged,
-    )
-    in_doubt = replace(
-        learning_state,
-        unexplained_steps=unexplained_steps,
-        doubt=doubt,
-        version=learning_state.version + (doubt.tried_plant is not None),
-    )
-    return _count_doubtful_lead(in_doubt, comparison.lead)
+    latest = _median(noise_ratios[-_LATEST_RATIOS:].ravel())
+    if not _NOTABLE_RATIO < latest < _LARGEST_RATIO:
+        latest = 0.0  # by chance, or no noise
+    ratio = np.full(len(model.gp_noise), latest)
+    count = len(noise_ratios)
+    unknown = max(0, _FEWEST_OF_MEDIAN - count)
+    if unknown <= count:
+        rank = (count - unknown) // 2
+        ratio = np.maximum(ratio, np.partition(noise_ratios, rank, axis=0)[rank])
+    return model.gp_noise * (ratio / _CHI2_MEDIAN).clip(1.0)
 
 
-def _begun_now(start: Expectation) -> Expectation:
-    """Returns an expectation from which on a change acts."""
-    return start._replace(
-        by_input=0.0 * start.by_input, by_change=0.0 * start.by_change
-    )
+def _median(values: Array) -> Any:
+    """Returns the median over the first axis, the upper one of an even number.
 
-
-def _without_last_measurement(
-    plants: tuple[NewPlant, ...],
-    step: LearningStep,
-    density_to_beat: float,
-) -> tuple[NewPlant, ...]:
-    """Returns new plants of which the last measurement, of a step, was wrong.
-
-    A plant that explains all outputs but one, and more than anything else does, is
-    tried: one sensor is wrong. The others are given up if the measurement before was
-    wrong already.
-
-    Args:
-        plants: Put forward by the measurement before.
-        step: The step that none of them explains.
-        density_to_beat: Bounded log density that the one of a plant has to exceed.
+    NumPy takes several times as long, which every step would pay.
     """
-    remaining_plants = []
-    for plant in plants:
-        surprise = plant.model.learning.surprise
-        expected = plant.after(step)
-        innovation = _innovation_of(plant, step, expected)
-        explained = int(np.count_nonzero(innovation.squares <= surprise))
-        several_explained = 1 < explained == len(innovation.error) - 1
-        density = innovation.bounded_log_density(surprise)
-        is_tried = several_explained and density > density_to_beat
-        if plant.expected is not None and not is_tried:
+    middle = len(values) // 2
+    return np.partition(values, middle, axis=0)[middle]
+
+
+def _ordinary_step(before: Explanation, step: LearningStep) -> Explanation | None:
+    """Goes on where all sensors are right; None where anything asks for another way."""
+    if not before.expected.is_certain or step.repeats.any() or is_settling(before):
+        return None
+    comparison = before.model.predict_then_learn(step)
+    innovation = comparison.planned(before.active)
+    # What is no number is not quiet, too.
+    if not innovation.largest_square <= QUIET:
+        return None
+    learned = replace(before, model=comparison.model_with_step)
+    return learned.believing(step.next_state).with_lead(comparison.lead)
+
+
+def _heaviest(candidates: Sequence[Continuation]) -> list[Continuation]:
+    """Returns the heaviest ways to go on, heaviest first, each plant and doubt once.
+
+    One that believes all sensors is always among those that are near enough: so no
+    doubt lasts.
+    """
+    ordered = sorted(candidates, key=lambda one: one.log_weight, reverse=True)
+    kept: list[Continuation] = []
+    for candidate in ordered:
+        if ordered[0].log_weight - candidate.log_weight > _LARGEST_LEAD:
+            break
+        if any(candidate.says_the_same(other) for other in kept):
             continue
-        confirmations_left = plant.confirmations_left
-        if is_tried:
-            confirmations_left = max(1, confirmations_left - 1)
-            trusted = _trusted_sensors(step, expected, plant.model)
-            expected = expected.conditioned_on(step.next_state, trusted, plant.model)
-        remaining_plants.append(
-            plant._replace(
-                model=plant.model.later(1.0),
-                expected=expected,
-                confirmations_left=confirmations_left,
-                tried=is_tried,
-            )
-        )
-    return tuple(remaining_plants)
+        nobody_believes = not any(other.believes_all for other in kept)
+        is_needed = candidate.believes_all and nobody_believes
+        if len(kept) < _MOST_EXPLANATIONS or is_needed:
+            kept.append(candidate)
+    return kept
 
 
-def _new_plant(
-    learning_state: LearningState,
-    step: LearningStep,
-    start: Expectation,
-    unexplained_steps: int,
-    steps_in_doubt: int,
-    may_be_tried: bool,
-) -> NewPlant:
-    """Returns the plant whose change explains a measurement.
+def _continued(
+    continuation: Continuation, heaviest: Continuation, step: LearningStep
+) -> Explanation:
+    """Returns an explanation after a step.
 
     Args:
-        learning_state: With the measurement.
-        step: That led to it.
-        start: Where the plant was before; ``by_change`` says since when it is changed.
-        unexplained_steps: Each asks for a further confirmation.
-        steps_in_doubt: This one included.
-        may_be_tried: Whether several sensors err together, from what is trusted.
+        continuation: How it goes on.
+        heaviest: How the heaviest one does.
+        step: Of the flight.
     """
-    model = learning_state.model.without_points()
-    surprise = model.learning.surprise
-    expected = start.after(step, model.model, model)
-    error = state_difference(step.next_state, expected.mean, model.angles)
-    from_change = np.linalg.pinv(expected.by_change)
-    variance = ((from_change @ expected.covariance) * from_change).sum(-1)
-    z, v, _ = model.features.linearize(start.mean[None], step.input[None])
-    observed = step._replace(
-        point=np.concatenate([z[0], v[0], [model.time]]),
-        observed_change=from_change @ error,
-        # What predicts adds the latent variance again.
-        noise_variance=np.maximum(variance - step.latent_variance, step.noise_variance),
+    is_as_before = not (continuation.is_new_plant or continuation.is_pushed)
+    agrees = continuation.believes_all and heaviest.believes_all
+    agreed_steps = 0
+    if is_as_before and agrees:
+        agreed_steps = continuation.explanation.agreed_steps + 1
+    before = replace(
+        continuation.explanation,
+        log_weight=continuation.log_weight - heaviest.log_weight,
+        agreed_steps=agreed_steps,
     )
-    comparison = model.predict_then_learn(observed)
-    further = comparison.with_change.largest_square / surprise
-    confirmations = 1 + unexplained_steps + int(min(further, _MOST_CONFIRMATIONS))
-    tried = False
-    if may_be_tried and confirmations <= steps_in_doubt <= _LONGEST_BRIDGE:
-        planned = learning_state.expect(start, step)
-        tried = _acts_like_input(
-            innovation=learning_state.innovation(planned),
-            by_input=model.B_inverse @ planned.by_input,
-            notable=surprise,
-        )
-    return NewPlant(
-        model=comparison.model_with_step.later(1.0),
-        expected=None,
-        confirmations_left=confirmations,
-        tried=tried,
-    )
-
-
-def _trusted_sensors(
-    step: LearningStep, expected: Expectation, model: ChangedModel
-) -> NDArray[np.bool_]:
-    """Returns which sensors (n,) move in a step, and show what is expected."""
-    error = state_difference(step.next_state, expected.mean, model.angles)
-    threshold = model.learning.surprise * np.diagonal(expected.covariance)
-    return (error**2 <= threshold) & ~step.repeats
-
-
-def _is_frozen(
-    learning_state: LearningState, step: LearningStep, expected: Expectation
-) -> bool:
-    """Returns whether a sensor repeats itself exactly while the plant moves."""
-    motion = state_difference(expected.mean, step.state, learning_state.model.angles)
-    threshold = learning_state.model.learning.surprise * np.diagonal(
-        expected.covariance
-    )
-    return bool(((motion**2 > threshold) & step.repeats).any())
-
-
-def _acts_like_input(
-    innovation: Innovation, by_input: Array, notable: float, deviations: float = 0.0
-) -> bool:
-    """Returns whether several outputs err in the proportion in which inputs act.
-
-    One wrong sensor is wrong alone, and several are not wrong in that proportion.
-
-    Args:
-        innovation: Of the model that plans.
-        by_input: Derivative of what it predicted by the input (k, m).
-        notable: Squared error over its variance from which on an output errs.
-        deviations: What noise may add to a proportion.
-    """
-    deviation = np.sqrt(innovation.variance)
-    errors = innovation.error / deviation
-    effects = by_input / deviation[:, None]
-    coefficients, _, rank, _ = np.linalg.lstsq(effects, errors, rcond=None)
-    several = np.count_nonzero(errors**2 > notable) > 1
-    remaining = np.linalg.norm(errors - effects @ coefficients)
-    tolerance = max(_MISALIGNED * float(np.linalg.norm(errors)), deviations)
-    aligned = remaining <= tolerance
-    # As many independent effects as outputs explain any errors.
-    return bool(several and aligned and rank < len(errors))
-
-
-def _resolve_doubt(
-    learning_state: LearningState,
-    step: LearningStep,
-    comparison: Comparison,
-    doubt: Doubt,
-) -> LearningState:
-    """Explains the measurement in doubt by the one after it."""
-    settings = learning_state.model.learning
-    # The measurement was wrong: what is measured follows from the state before it.
-    expected_if_wrong = learning_state.expect(doubt.expected, step)
-    if_wrong = learning_state.innovation(expected_if_wrong)
-    # The plant was moved: what is measured follows from the measurement in doubt.
-    if_moved = comparison.planned(learning_state.active)
-
-    density_to_beat = max(if_wrong.log_density, if_moved.log_density) + LARGEST_LEAD
-    plants = [_confirmed(plant, step, density_to_beat) for plant in doubt.new_plants]
-    confirmed = tuple(plant for plant in plants if plant is not None)
-    for plant in confirmed:
-        if plant.confirmations_left == 0:
-            return _switch_plant(learning_state.without_doubt(doubt), plant.model)
-    if confirmed:
-        continued_doubt = _continued_doubt(
-            learning_state,
-            step,
-            doubt,
-            expected_if_wrong,
-            new_plants=tuple(p._replace(model=p.model.later(1.0)) for p in confirmed),
-        )
-        confirmed_once = replace(
-            learning_state, doubt=continued_doubt, version=learning_state.version + 1
-        )
-        return _count_doubtful_lead(confirmed_once, comparison.lead)
-    if if_wrong.largest_square <= settings.surprise:
-        return _count_doubtful_lead(
-            learning_state.without_doubt(doubt), comparison.lead
-        )
-    if if_moved.largest_square <= settings.surprise:
-        # A plant that moves is seen by several sensors; one alone may be wrong twice.
-        is_single_sensor = np.count_nonzero(if_wrong.squares > settings.surprise) == 1
-        if (
-            is_single_sensor
-            and doubt.bridged
-            and doubt.steps_in_doubt < _LONGEST_BRIDGE
-        ):
-            # Nor is a measurement acted on that follows from the one in doubt.
-            continued_doubt = _continued_doubt(
-                learning_state, step, doubt, expected_if_wrong, bridged=True
-            )
-            after = replace(learning_state, doubt=continued_doubt)
-        else:
-            after = learning_state.without_doubt(doubt)
-        return _count_doubtful_lead(after, comparison.lead)
-    bounded_density = max(
-        if_wrong.bounded_log_density(settings.surprise),
-        if_moved.bounded_log_density(settings.surprise),
-    )
-    return _put_in_doubt(
-        learning_state,
-        step,
-        comparison,
-        expected_if_wrong,
-        doubt.trusted_noise_ratios,
-        bounded_density_to_beat=bounded_density + LARGEST_LEAD,
-    )
-
-
-def _continued_doubt(
-    learning_state: LearningState,
-    step: LearningStep,
-    doubt: Doubt,
-    expected_if_wrong: Expectation,
-    new_plants: tuple[NewPlant, ...] = (),
-    bridged: bool = False,
-) -> Doubt:
-    """Returns a doubt that lasts a step longer.
-
-    Args:
-        learning_state: With the measurement of now.
-        step: The step that led to it.
-        doubt: By the step before.
-        expected_if_wrong: Where the plant is if all measurements in doubt are wrong.
-        new_plants: Those that the next step may confirm.
-        bridged: Whether the controller acts on what is expected.
-    """
-    model = learning_state.model
-    trusted = _trusted_sensors(step, expected_if_wrong, model)
-    return Doubt(
-        expected=expected_if_wrong.conditioned_on(learning_state.state, trusted, model),
-        trusted=trusted,
-        trusted_noise_ratios=doubt.trusted_noise_ratios,
-        new_plants=new_plants,
-        steps_in_doubt=doubt.steps_in_doubt + 1,
-        bridged=bridged,
-    )
-
-
-def _resolve_outside_model(
-    before: LearningState,
-    doubt: Doubt,
-    input: Array,
-    measured: Array,
-    observed: ObservedChange,
-) -> LearningState:
-    """Takes the measurement in doubt, where the model has no number, for wrong.
-
-    So the one after it (n,) has to follow from the state before the doubt.
-    """
+    expected = _expected_state(continuation, step)
+    after = replace(before, expected=expected, began=continuation.began)
+    if continuation.is_pushed or step.repeats.all():
+        return after  # that teaches nothing
     model = before.model
-    unknown = np.full_like(before.observed_change, np.nan)
-    learning_state = before.with_measurement(measured, unknown, before.noise_ratios)
-    step = LearningStep(
-        state=before.state,
-        input=input,
-        next_state=measured,
-        point=observed.point,
-        observed_change=unknown,
-        latent_variance=observed.latent_variance,
-        noise_variance=_noise_variance(doubt.trusted_noise_ratios, model),
+    if continuation.is_new_plant:
+        model = model.without_points()
+    comparison = model.predict_then_learn(
+        _observed_step(continuation, expected, step, model)
     )
-    expected = learning_state.expect(doubt.expected, step)
-    innovation = learning_state.innovation(expected)
-    if innovation.largest_square <= model.learning.surprise:
-        return learning_state.without_doubt(doubt).later()
-    acts_like_input = _acts_like_input(
-        innovation=innovation,
-        by_input=model.B_inverse @ expected.by_input,
-        notable=_NOTABLE,
-        deviations=_DEVIATIONS,
-    )
-    may_be_bridged = doubt.steps_in_doubt < _LONGEST_BRIDGE
-    continued_doubt = _continued_doubt(
-        learning_state,
-        step,
-        doubt,
-        expected,
-        bridged=may_be_bridged and not acts_like_input,
-    )
-    unexplained_steps = min(learning_state.unexplained_steps + 1, _PATIENCE)
-    return replace(
-        learning_state,
-        doubt=continued_doubt,
-        unexplained_steps=unexplained_steps,
-        version=learning_state.version + learning_state.active,
-    ).later()
+    learned = replace(after, model=comparison.model_with_step)
+    if continuation.is_new_plant:
+        return replace(learned, active=True, leads=np.empty(0))
+    return learned.with_lead(comparison.lead)
 
 
-def _confirmed(
-    plant: NewPlant, step: LearningStep, density_to_beat: float
-) -> NewPlant | None:
-    """Returns a new plant that explains a further step; None where it does not.
+def _expected_state(continuation: Continuation, step: LearningStep) -> Expectation:
+    """Returns where the plant is after a step."""
+    wrong = continuation.wrong
+    if not wrong.any():
+        return Expectation.certain(step.next_state)
+    expected = continuation.expected
+    if continuation.is_pushed:  # and a sensor is frozen: the others say nothing of it
+        return Expectation(
+            mean=np.where(wrong, expected.mean, step.next_state),
+            covariance=np.where(np.outer(wrong, wrong), expected.covariance, 0.0),
+        )
+    angles = continuation.explanation.model.angles
+    error = state_difference(step.next_state, expected.mean, angles)
+    return expected.conditioned_on(error, step.next_state, ~wrong)
+
+
+def _observed_step(
+    continuation: Continuation,
+    expected: Expectation,
+    step: LearningStep,
+    model: ChangedModel,
+) -> LearningStep:
+    """Returns what a step says of the change, by an explanation.
 
     Args:
-        plant: The new plant.
-        step: The further step.
-        density_to_beat: Log density that the new plant's has to exceed.
+        continuation: How it goes on.
+        expected: Where the plant is after the step.
+        step: Of the flight.
+        model: With the change that the step is to teach.
     """
-    if step.repeats.all():
-        return None
-    model = plant.model
-    if plant.expected is None:
-        comparison = model.predict_then_learn(step)
-        innovation = comparison.with_change
-        model = comparison.model_with_step
-    else:
-        innovation = _innovation_of(plant, step, plant.after(step))
-    explained = innovation.largest_square <= model.learning.surprise
-    if not (explained and innovation.log_density > density_to_beat):
-        return None
-    return plant._replace(
-        model=model,
-        expected=None,
-        confirmations_left=plant.confirmations_left - 1,
+    predicted: Forecast = continuation.forecast
+    change = state_difference(expected.mean, predicted.mean, model.angles)
+    variance = model.explainable_variance(expected.covariance)
+    if not continuation.is_new_plant:
+        # What is only predicted is what the change has said itself.
+        variance = _UNTAUGHT * variance
+    return LearningStep(
+        state=continuation.explanation.expected.mean,
+        input=step.input,
+        next_state=expected.mean,
+        point=predicted.point,
+        observed_change=model.B_inverse @ change,
+        latent_variance=model.explainable_variance(predicted.latent),
+        noise_variance=(
+            step.noise_variance
+            + model.explainable_variance(predicted.from_start)
+            + variance
+        ),
     )
-
-
-def _innovation_of(
-    plant: NewPlant, step: LearningStep, expected: Expectation
-) -> Innovation:
-    """Computes the innovation of a step that a new plant predicts."""
-    model = plant.model
-    error = state_difference(step.next_state, expected.mean, model.angles)
-    return Innovation(
-        error=model.B_inverse @ error,
-        variance=model.explainable_variance(expected.covariance),
-    )
-
-
-def _switch_plant(
-    learning_state: LearningState, new_plant: ChangedModel
-) -> LearningState:
-    """Forgets what was seen, and uses the change of another plant."""
-    switched = replace(
-        learning_state,
-        model=new_plant,
-        leads=learning_state.leads[:0],
-        active=True,
-        version=learning_state.version + 1,
-        doubt=None,
-    )
-    return switched.later()

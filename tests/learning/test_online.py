@@ -17,8 +17,8 @@ from gpmpc.learning import (
     OnlineLearning,
     learn_from_step,
 )
+from gpmpc.learning._continuations import continuations, forecast
 from gpmpc.learning._innovation import LearningStep
-from gpmpc.learning._state import Expectation
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc import (
     GPMPC,
@@ -305,7 +305,7 @@ def test_a_step_is_expected_with_noise_of_states_without_gps():
     )
     noise = gp.noise_covariance + torch.diag(torch.tensor([0.3, 0.0]))
     changed = ChangedModel(replace(gp, noise=noise))
-    state = LearningState.begin(changed, np.zeros(2))
+    explanation = LearningState.begin(changed, np.zeros(2)).heaviest
     step = LearningStep(
         state=np.zeros(2),
         input=np.zeros(1),
@@ -315,7 +315,8 @@ def test_a_step_is_expected_with_noise_of_states_without_gps():
         latent_variance=np.zeros(1),
         noise_variance=changed.gp_noise,
     )
-    expected = state.expect(Expectation.certain(np.zeros(2), changed), step)
+    predicted = forecast(explanation, step.input)
+    expected = continuations(explanation, predicted, step)[0].expected
     latent = gp.predict(torch.zeros(2), torch.zeros(1)).covariance
     assert np.allclose(expected.covariance, (latent + noise).numpy())
 
