@@ -72,7 +72,7 @@ def fly_chunk(chunk: Chunk) -> None:
 
     Raises:
         GpmpcError: Runs could not be begun, for reasons that their folders cannot hold.
-            Those are all of the chunk that have not ended.
+            They are all of the chunk without an end, but for those of another process.
     """
     began = time.monotonic()
     problems: dict[str, None] = {}
@@ -86,7 +86,8 @@ def fly_chunk(chunk: Chunk) -> None:
                 problems[" ".join(str(error).split())] = None
         work = time.monotonic() - began
         is_long = chunk.most_work is not None and work > chunk.most_work
-        # What is left without an end counts as failed by the problems.
+        # With a problem, the caller fails every run without an end: all others fly
+        # first.
         if is_long and not problems:
             break
     if problems:

@@ -150,7 +150,8 @@ class Flying:
         """Lets failures of an adopted chunk count, also those before this sweep looked.
 
         Args:
-            launched: When the chunk was [ns]; what failed before is of an earlier call.
+            launched: When the chunk was launched [ns]; what failed before is of an
+                earlier call.
             chunk: Whose runs they are.
         """
         for open_job in self._open_jobs(chunk):

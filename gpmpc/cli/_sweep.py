@@ -413,8 +413,8 @@ def print_failed(outcomes: Iterable[JobOutcome]) -> None:
 def cannot_go_on(tree: Path, reason: str) -> Result:
     """Says that the command cannot go on, such as where a disk is full."""
     print_error(
-        f"{reason}; the sweep ended before its runs did, and the same command goes on "
-        "where it stopped"
+        f"{reason}; not all runs were flown, and the same command goes on where it "
+        "stopped"
     )
     return Result({"folder": str(tree), "error": reason}, 1)
 

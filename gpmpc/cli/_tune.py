@@ -237,12 +237,13 @@ def _space(
         if not override.is_sweep_override():
             fixed.append(str(override.input_line))
             continue
-        if key == "recorder":
+        name = key.lstrip("+")
+        if name == "recorder":
             raise SettingError(
-                key, "cannot be searched: a flight's cost is read from its recording"
+                name, "cannot be searched: a flight's cost is read from its recording"
             )
-        if key == "seed" or is_shared(key):
-            raise SettingError(key, "cannot be searched; seeds are many by --seeds")
+        if name == "seed" or is_shared(key):
+            raise SettingError(name, "cannot be searched; seeds are many by --seeds")
         if override.is_interval_sweep():
             interval = _interval(key, override)
             _check_least_steps(key, [interval.low])

@@ -492,7 +492,7 @@ def _pooled(flights: Mapping[str, list[dict]]) -> list[dict]:
 
 
 def _first_error(records: Iterable[Mapping[str, Any]]) -> str | None:
-    """Says which of the flights was lost first, and how; None if none was."""
+    """Says which flight was the first that failed or was lost, and how, or None."""
     for record in records:
         if "error" in record:
             text = f"{record['trajectory']}, seed {record['seed']}: {record['error']}"

@@ -9,8 +9,8 @@ from gpmpc.export._text import Numbers, integers
 from gpmpc.gp import GPPosterior
 
 _LOG2_E = 1.0 / np.log(2.0)
-# A sum of squares is scaled to 32 bits, by ``bits``, which with the 31 of a square are
-# moved to the 40 of u: by ``bits - 9`` to the right, so that fewer do not reach.
+# A square has 31 bits behind the point, and ``bits`` more by the scale of its sum. They
+# are moved to the 40 of u, to the right by ``bits + 31 - 40``, which is never negative.
 _LEAST_BITS = 40 - 31
 _MOST_BITS = 60
 # Of the magnitudes of weights: a smaller one is none, as of an output whose targets are

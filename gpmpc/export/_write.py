@@ -167,7 +167,7 @@ def _check_own_names(texts: Iterable[str], name: str) -> None:
     words = set(re.findall(r"\w+", code))
     renamed = {word: _renamed(word, name) for word in words}
     taken = sorted(own for word, own in renamed.items() if own != word and own in words)
-    if taken and name != _NAME:
+    if taken:
         rule = f"the code has names of its own that begin with {name}_"
         raise SettingError("name", f"{rule}, such as {taken[0]}; take another one")
 

@@ -99,7 +99,7 @@ def flight_figure(rollout: "Rollout", system: "System") -> Figure:
                 color=ORANGE,
                 linewidth=1,
                 alpha=0.6,
-                label="failed decision",
+                label="failed solve",
                 zorder=0,
             )
     axes[-1, 0].set_xlabel("time [s]")

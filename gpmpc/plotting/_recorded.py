@@ -438,7 +438,7 @@ def _mark_failures(run: "Run", *axes: Axes) -> None:
                 color=ORANGE,
                 linewidth=1,
                 alpha=0.6,
-                label="failed decision",
+                label="failed solve",
                 zorder=0,
             )
 

@@ -190,11 +190,11 @@ def _run_in_worker(
 class TrialStore:
     """Records of finished trials, in a file of one JSON object a line.
 
-    A line that a crash cut short is skipped. Who appends holds the store: two processes
-    would run each trial twice, and disturb each other's times.
+    A line that a crash cut short is skipped. Where two processes may share a file, one
+    opens it with ``held``: both would run each trial, and disturb each other's times.
 
     Args:
-        path: The file; the first ``append`` makes it.
+        path: The file; ``held`` or the first ``append`` makes it.
     """
 
     def __init__(self, path: Path):

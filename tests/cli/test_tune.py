@@ -138,6 +138,8 @@ def test_flights_that_failed_are_told_and_cost_no_number(
         (["horizon=1,2", "steps=1"], "steps: must be 2 or more"),
         (["steps=1,50"], "steps: must be 2 or more"),
         (["recorder=mcap,none"], "recorder: cannot be searched"),
+        (["++recorder=mcap,none"], "recorder: cannot be searched"),
+        (["++seed=1,2"], "seed: cannot be searched"),
         (
             ["controller.tolerance=interval(2,1)"],
             "controller.tolerance: must rise; got",
@@ -211,7 +213,7 @@ def test_a_full_disk_ends_a_search_that_goes_on_later(tmp_path, monkeypatch, cap
     with settings_folders():
         assert _tune.tune(arguments).code == 1
     said = capsys.readouterr().err
-    assert f"{tmp_path}: No space left on device; the sweep ended before" in said
+    assert f"{tmp_path}: No space left on device; not all runs were flown" in said
     assert "the same command goes on where it stopped" in said
 
 
