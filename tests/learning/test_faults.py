@@ -262,7 +262,7 @@ def test_a_glitch_teaches_nothing(entry, size):
     assert np.abs(change_at(later) - change_at(sound_steps[22])).max() < 0.5
 
 
-def test_a_sensor_that_is_wrong_now_and_then_is_not_taken_for_noisy():
+def test_a_sensor_that_is_wrong_now_and_then_is_not_noisy():
     states, inputs = excited(40)
     states[4:40:8, 1] += 1.0  # so is every fourth difference
     last = taught(states, inputs)[-1]
@@ -332,7 +332,7 @@ def test_a_change_that_acts_like_an_input_is_used_at_once():
 
 
 @pytest.mark.parametrize("size", [0.1, 0.5])
-def test_a_glitch_as_the_plant_changes_is_not_taken_for_the_change(size):
+def test_a_glitch_as_the_plant_changes_is_no_change(size):
     states, inputs = excited(20)
     learned = taught(states, inputs)[-1]
     input = np.array([1.0])
@@ -387,7 +387,7 @@ def test_a_frozen_sensor_is_no_witness_of_a_change():
     assert not any(one.active for one in steps[:26])
 
 
-def test_a_change_that_ends_beside_a_wrong_measurement_is_not_used_on():
+def test_a_change_that_ends_beside_a_glitch_is_not_used_on():
     states, inputs = excited(40, wind_from=20)
     learned = taught(states, inputs)[-1]
     assert learned.active
