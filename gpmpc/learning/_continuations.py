@@ -19,13 +19,15 @@ _NEW_PLANT = -12.0
 _PUSH = -18.0
 # Log prior of a change that acts on each output for itself, not like an input.
 _OUTPUTS_APART = -3.0
-# Log prior of each further sensor that is wrong: they fail one by one.
+# Log prior of each sensor that is wrong, but for the first: they fail one by one.
 _ANOTHER_SENSOR = -5.0
 # Steps for which a new plant does not change again: its first points are still to say
 # how the change depends on state and input.
 _SETTLING_STEPS = 5
+_NEARLY_ZERO = 1e-100  # squared effect of an input
 _INDEPENDENT = 0.01  # part of each deviation that no other sensor knows, at least
 _NEGLIGIBLE = 40.0  # log weight below the heaviest, from which on nothing is kept
+_UNKNOWN_VARIANCE = 1e60  # of what nobody knows
 _HOPELESS = 1e8  # squared error over its variance that double precision compares
 
 
@@ -125,6 +127,9 @@ def continuations(
     B = model.B_array
     surprise = model.learning.surprise
     noise = (B * step.noise_variance) @ B.T + np.diag(model.further_noise)
+    # Of a sensor whose noise nobody knows nothing is asked.
+    has_no_noise = np.diagonal(noise) == 0.0
+    noise += np.diag(np.where(has_no_noise, _UNKNOWN_VARIANCE, 0.0))
     same_plant = _same_plant(explanation, predicted, step.input, noise)
     expected = same_plant[0].expected
     variance = np.min(
@@ -248,9 +253,8 @@ def _like_input(explanation: Explanation, predicted: Forecast) -> Array:
     """
     model = explanation.model
     by_input = model.B_inverse @ predicted.by_input
-    smallest = np.finfo(np.float64).tiny
-    scale = (model.signal[:, None] / (by_input**2).clip(smallest)).min(0)
-    return (by_input * scale.clip(None, 1.0 / smallest**0.5)) @ by_input.T
+    scale = (model.signal[:, None] / (by_input**2).clip(_NEARLY_ZERO)).min(0)
+    return (by_input * scale.clip(None, 1.0 / _NEARLY_ZERO)) @ by_input.T
 
 
 def _sensor_sets(

@@ -19,19 +19,6 @@ class Innovation(NamedTuple):
     variance: Array  #: expected of the error (k,)
 
     @property
-    def squares(self) -> Array:
-        """Squared errors over their variances (k,)."""
-        return self.error**2 / self.variance
-
-    def bounded_log_density(self, largest_square: float) -> float:
-        """Log density where each output may be wrong.
-
-        Its square counts for no more than ``largest_square``.
-        """
-        squares = self.squares.clip(None, largest_square)
-        return -0.5 * float((squares + np.log(self.variance)).sum())
-
-    @property
     def largest_square(self) -> float:
         """The largest squared error over its variance."""
         return float((self.error**2 / self.variance).max())

@@ -61,7 +61,7 @@ class Explanation:
     log_weight: float = 0.0  #: over that of the heaviest explanation
     #: time at which the plant became the one that it is [steps]; None if it always was
     began: float | None = None
-    #: steps for which it has agreed with the heaviest one that all sensors are right
+    #: steps for which it has agreed with a heavier one that all sensors are right
     agreed_steps: int = 0
 
     @classmethod
@@ -139,7 +139,7 @@ class LearningState:
     @property
     def active(self) -> bool:
         """Whether the change is used."""
-        return self.heaviest.active
+        return self.planning is not None
 
     @property
     def leads(self) -> Array:
@@ -195,16 +195,10 @@ class LearningState:
         """Returns the state after a decision has failed.
 
         The change is not used for this decision, nor is anything assumed in the place
-        of the measurement. The leads stay: they speak of predictions, and the next
-        decision, elsewhere, may succeed with the change.
+        of the measurement. The explanations stay: they speak of predictions, and the
+        next decision, elsewhere, may succeed.
         """
-        heaviest = replace(self.heaviest, active=False)
-        return replace(
-            self,
-            explanations=(heaviest, *self.explanations[1:]),
-            version=self.version + 1,
-            has_failed=True,
-        )
+        return replace(self, version=self.version + 1, has_failed=True)
 
     def after_gap(self, state: Array) -> "LearningState":
         """Returns the state after steps without a measurement, at the next one (n,).

@@ -5,6 +5,7 @@ The package's text describes the method.
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -37,7 +38,6 @@ _LARGEST_RATIO = 1e4
 # Differences of which the median is taken, at least: those that are not known yet count
 # as of the model's own noise, since one sensor may be wrong from the beginning.
 _FEWEST_OF_MEDIAN = 16
-_CHI2_MEDIAN = float(chi2.median(1))
 _MOST_EXPLANATIONS = 8
 _LARGEST_LEAD = 20.0  # of the heaviest explanation's log weight, over those kept
 # Steps for which a lighter explanation may agree with the heaviest on the state.
@@ -84,7 +84,7 @@ def learn_from_step(
         point=predicted.point,
         observed_change=observed_change,
         latent_variance=model.explainable_variance(predicted.latent),
-        noise_variance=_noise_variance(after.noise_ratios, model),
+        noise_variance=_noise_variance(after.noise_ratios, before.heaviest),
     )
     if len(before.explanations) == 1:
         ordinary = _ordinary_step(before.heaviest, step)
@@ -113,26 +113,45 @@ def _with_noise_ratio(before: LearningState, observed_change: Array) -> Array:
     return np.vstack([before.noise_ratios, ratio])[-_MOST_RATIOS:]
 
 
-def _noise_variance(noise_ratios: Array, model: ChangedModel) -> Array:
+def _noise_variance(noise_ratios: Array, heaviest: Explanation) -> Array:
     """Returns the noise (k,) of the model, or of the last steps where that is more.
 
-    What changes slowly has no part in differences of successive errors, and a sensor
-    that is wrong now and then no weight in their median.
+    Differences of successive errors tell, in the median: what changes slowly has no
+    part in them, and a sensor that is wrong now and then no weight. A change that
+    varies fast has, in those of the outputs that it acts on. So where one is used, the
+    outputs tell together where that is less.
 
     Args:
         noise_ratios: Of the last steps (w, k).
-        model: With the noise of its data.
+        heaviest: The explanation that plans.
     """
+    gp_noise = heaviest.model.gp_noise
+    outputs = len(gp_noise)
+    median = _median_with_unknown(noise_ratios) / _chi2_median(1)
+    if heaviest.active:
+        mean_ratios = noise_ratios.mean(axis=1)
+        together = _median_with_unknown(mean_ratios) * outputs / _chi2_median(outputs)
+        median = np.minimum(median, together)
     latest = _median(noise_ratios[-_LATEST_RATIOS:].ravel())
     if not _NOTABLE_RATIO < latest < _LARGEST_RATIO:
         latest = 0.0  # by chance, or no noise
-    ratio = np.full(len(model.gp_noise), latest)
-    count = len(noise_ratios)
+    ratio = np.maximum(median, latest / _chi2_median(1))
+    return gp_noise * ratio.clip(1.0)
+
+
+@cache
+def _chi2_median(degrees: int) -> float:
+    return float(chi2.median(degrees))
+
+
+def _median_with_unknown(ratios: Array) -> Any:
+    """Returns the median over the first axis, where unknown ones count as zero."""
+    count = len(ratios)
     unknown = max(0, _FEWEST_OF_MEDIAN - count)
-    if unknown <= count:
-        rank = (count - unknown) // 2
-        ratio = np.maximum(ratio, np.partition(noise_ratios, rank, axis=0)[rank])
-    return model.gp_noise * (ratio / _CHI2_MEDIAN).clip(1.0)
+    if unknown > count:
+        return 0.0 * ratios[0]
+    rank = (count - unknown) // 2
+    return np.partition(ratios, rank, axis=0)[rank]
 
 
 def _median(values: Array) -> Any:
@@ -190,7 +209,7 @@ def _continued(
     is_as_before = not (continuation.is_new_plant or continuation.is_pushed)
     agrees = continuation.believes_all and heaviest.believes_all
     agreed_steps = 0
-    if is_as_before and agrees:
+    if is_as_before and agrees and continuation is not heaviest:
         agreed_steps = continuation.explanation.agreed_steps + 1
     before = replace(
         continuation.explanation,

@@ -1,6 +1,7 @@
 """The command line as a user meets it: help, results, one clear line for a mistake."""
 
 import json
+import logging
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -305,6 +306,10 @@ def test_a_study_tells_failures_from_losses(
     )
     monkeypatch.setattr(_study, "_study", lambda *_: published)
     monkeypatch.setattr(_study, "_run_trials", lambda *_: (trials, records))
+    # A command gives the package's log a handler, and its process ends.
+    log = logging.getLogger("gpmpc")
+    for attribute in ("handlers", "propagate", "level"):
+        monkeypatch.setattr(log, attribute, getattr(log, attribute))
     result = _study.study(OmegaConf.create({"folder": str(tmp_path)}))
     said = capsys.readouterr().out.splitlines()
     ends = [line for line in said if ": draw " in line]

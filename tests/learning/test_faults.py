@@ -266,7 +266,7 @@ def test_a_sensor_that_is_wrong_now_and_then_is_not_noisy():
     states, inputs = excited(40)
     states[4:40:8, 1] += 1.0  # so is every fourth difference
     last = taught(states, inputs)[-1]
-    noise = _noise_variance(last.noise_ratios, last.model)
+    noise = _noise_variance(last.noise_ratios, last.heaviest)
     assert (noise < 3.0 * last.model.gp_noise).all()
 
 
