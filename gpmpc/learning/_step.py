@@ -116,10 +116,10 @@ def _with_noise_ratio(before: LearningState, observed_change: Array) -> Array:
 def _noise_variance(noise_ratios: Array, heaviest: Explanation) -> Array:
     """Returns the noise (k,) of the model, or of the last steps where that is more.
 
-    Differences of successive errors tell, in the median: what changes slowly has no
-    part in them, and a sensor that is wrong now and then no weight. A change that
-    varies fast has, in those of the outputs that it acts on. So where one is used, the
-    outputs tell together where that is less.
+    The median of differences of successive errors tells it: what changes slowly has no
+    part in them, and a sensor that is wrong now and then has no weight. A change that
+    varies fast adds to the differences of the outputs that it acts on. So where a
+    change is used, the median over all outputs together counts where it is less.
 
     Args:
         noise_ratios: Of the last steps (w, k).

@@ -8,9 +8,8 @@ taken, a step is as long as it lowers the exact penalty
 
 with mu above the multipliers of the dynamics (Nocedal and Wright, 2006, section 18.3).
 The price of a row is twice its largest multiplier (of hard rows the largest of all),
-and at most its own: under an exact
-price of 1e6 weights a step along a curved row would be refused for what it misses in
-second order (the Maratos effect; section 15.5 there).
+and at most its own: under an exact price of 1e6 weights a step along a curved row would
+be refused for what it misses in second order (the Maratos effect; section 15.5 there).
 Beside each length stands a second candidate: the dynamics rolled out under the feedback
 u = u' - K (x - x') towards the plan that the program proposes. It has no defects, and
 exists where inputs alone would lead an unstable plant away.
