@@ -321,6 +321,25 @@ def test_a_step_is_expected_with_noise_of_states_without_gps():
     assert np.allclose(expected.covariance, (latent + noise).numpy())
 
 
+def test_a_sensor_of_unknown_noise_is_never_in_doubt():
+    effect = torch.tensor([[0.0], [1.0]])  # no noise is known of the position
+    model = ResidualModel.train(
+        Affine.identity(2, 1), DATA, effect, trainer=Trainer(restarts=0)
+    )
+    learned = LearningState.begin(ChangedModel(model), np.zeros(2))
+    random = np.random.default_rng(0)
+    state = np.zeros(2)
+    for k in range(20):
+        input = random.uniform(-1, 1, 1)
+        state = cart(state, input) + 0.01 * random.normal(size=2)
+        glitch = np.array([0.0, 5.0 * (k == 15)])
+        learned = learn_from_step(learned, input, state + glitch)
+        weights = [one.log_weight for one in learned.explanations]
+        assert np.isfinite(weights).all()
+        assert not learned.sensors_in_doubt[0]
+    assert learned.assumed is None
+
+
 def test_what_cannot_be_learned_is_refused():
     with pytest.raises(SettingError, match="with_model"):
         LearningController(object())
