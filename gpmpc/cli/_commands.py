@@ -111,12 +111,12 @@ _TRUST = _argument(
     action="append",
     default=[],
     metavar="PACKAGE",
-    help="a package of yours whose code the recording's settings may call; repeatable",
+    help="allow the recording's settings to call code of this package; repeatable",
 )
 
 COMMANDS = {
     "run": Subcommand(
-        "Trains a model, flies with it, records; with -m a sweep of many flights",
+        "Trains a model, flies with it, records; -m: a sweep of many flights",
         module="_run",
         arguments=[_flag("--multirun", "-m"), *_SETTINGS],
         has_settings=True,
@@ -141,14 +141,14 @@ COMMANDS = {
         resumes=True,
     ),
     "figures": Subcommand(
-        "Flies figures 2 to 4 and section 5.2, also with the plant in the loop",
+        "Flies figures 2 to 4 and section 5.2 of that paper; also on the plant",
         module="_study",
         arguments=_SETTINGS,
         has_settings=True,
         resumes=True,
     ),
     "quality": Subcommand(
-        "Measures closed-loop cost over the time of a decision",
+        "Measures the closed-loop cost and the decision time of all controllers",
         module="_study",
         arguments=_SETTINGS,
         has_settings=True,
@@ -161,40 +161,40 @@ COMMANDS = {
             _argument(
                 "name",
                 metavar="NAME",
-                help="of the system: letters, digits and _, a letter first",
+                help="name of the system: letters, digits and _, a letter first",
             ),
-            _folder("an empty folder, or one to be made (NAME)"),
+            _folder("folder of the project; new or empty (NAME)"),
         ],
     ),
     "status": Subcommand(
-        "Shows how far the runs of a sweep are, and why some failed",
+        "Shows the progress of a sweep, and why runs failed",
         module="_status",
         arguments=[
             _argument(
                 "tree",
                 type=Path,
                 metavar="FOLDER",
-                help="of a sweep, or one with sweeps below it",
+                help="folder of a sweep, or one with sweeps below it",
             ),
         ],
     ),
     "report": Subcommand(
-        "Tabulates all runs below a folder; compares two groups of them",
+        "Tabulates all runs below a folder, or compares two groups of them",
         module="_report",
         arguments=[
             _argument(
                 "tree",
                 type=Path,
                 metavar="OUTPUTS",
-                help="a folder with runs anywhere below it",
+                help="folder with runs anywhere below it",
             ),
-            _folder("where the documents go (OUTPUTS/report)"),
+            _folder("folder of the report (OUTPUTS/report)"),
             _argument(
                 "--compare",
                 nargs=2,
                 metavar=("A", "B"),
-                help="choices that make two groups, such as controller=lqr "
-                "controller=convex: a paired test over the seeds",
+                help="compare two groups by a paired test over the seeds, such as "
+                "controller=lqr controller=convex",
             ),
         ],
     ),
@@ -203,23 +203,23 @@ COMMANDS = {
         module="_plot",
         arguments=[
             _argument("run", type=Path, metavar="RUN", help=_RECORDED),
-            _folder("where the figures go (RUN/figures)"),
+            _folder("folder of the figures (RUN/figures)"),
             _argument(
                 "--format",
                 choices=("png", "pdf", "svg"),
                 default="png",
-                help="of the figures (png)",
+                help="format of the figures (png)",
             ),
-            _flag("--no-animation", help="figures only: they take a second"),
+            _flag("--no-animation", help="draw the figures only, in a second"),
             _flag(
                 "--film",
-                help="a system of MuJoCo: the animation as MuJoCo renders it",
+                help="let MuJoCo render the animation; for systems of MuJoCo",
             ),
             _TRUST,
         ],
     ),
     "calibrate": Subcommand(
-        "Predicts recorded flights with a run's model, and judges it",
+        "Judges a run's model by its predictions of recorded flights",
         module="_calibrate",
         arguments=[
             _argument(
@@ -233,15 +233,15 @@ COMMANDS = {
                 type=Path,
                 nargs="*",
                 metavar="FLIGHT",
-                help=f"what is predicted (RUN): {_RECORDED}",
+                help=f"flights to predict (RUN): {_RECORDED}",
             ),
             _argument(
                 "--steps",
                 type=int,
                 default=50,
-                help="length of the longest prediction (50)",
+                help="steps of the longest prediction (50)",
             ),
-            _folder("where all goes (RUN/calibration)"),
+            _folder("folder of the results (RUN/calibration)"),
             _TRUST,
         ],
     ),
@@ -256,37 +256,36 @@ COMMANDS = {
                 metavar="RUN",
                 help="a run's folder or recording; its model is learned again",
             ),
-            _folder("where the code goes (RUN/c)"),
+            _folder("folder of the code (RUN/c)"),
             _argument(
                 "--precision",
                 choices=["double", "float"],
                 default="double",
-                help="of all numbers (double)",
+                help="type of all numbers (double)",
             ),
             _argument(
                 "--budget",
                 metavar="LIMITS",
-                help="what the code may take, such as "
-                "flash=64kB,ram=32kB,instructions=2M: as many points are kept as fit, "
-                "and a table shows what fewer cost",
+                help="limits of the code, such as flash=64kB,ram=32kB,instructions=2M; "
+                "keeps as many training points as fit, and prints what fewer cost",
             ),
             _argument(
                 "--chip",
                 choices=["cortex-m4f", "cortex-m7", "host"],
-                help="that the budget is measured for (cortex-m4f where "
+                help="chip that the budget is measured for (cortex-m4f where "
                 "arm-none-eabi-gcc is installed, else host)",
             ),
             _argument(
                 "--points",
                 type=int,
                 metavar="N",
-                help="how many points are kept, those that explain most (all)",
+                help="number of training points to keep, those that explain most (all)",
             ),
             _argument(
                 "--name",
                 default="gpmpc",
-                help="of header and source, and what their names begin with, such as "
-                "outer for outer_step: two controllers of one program need two (gpmpc)",
+                help="name of header and source, and prefix of their functions: outer "
+                "gives outer_step; two controllers in one program need two (gpmpc)",
             ),
             _TRUST,
         ],
@@ -299,7 +298,7 @@ COMMANDS = {
             _argument(
                 "mapping",
                 type=Path,
-                help="a YAML file that says what the columns mean",
+                help="YAML file that says what the columns mean",
             ),
             _argument(
                 "files",
@@ -313,75 +312,75 @@ COMMANDS = {
                 nargs="+",
                 metavar="RUN",
                 default=[],
-                help="runs to judge it on (by default a fifth of those that can tell)",
+                help="runs to judge the model on (a fifth of the runs that are long "
+                "enough; of a single run its end)",
             ),
             _folder("folder for the model, its report and its card (learned)"),
             _argument(
                 "--points",
                 type=int,
                 default=300,
-                help="training rows of a GP, at most (300)",
+                help="most training rows of a GP (300)",
             ),
             _argument(
                 "--steps",
                 type=int,
                 default=50,
-                help="longest prediction it is judged by (50)",
+                help="steps of the longest prediction that the model is judged by (50)",
             ),
             _argument(
                 "--seed", type=int, default=0, help="seed of all random choices (0)"
             ),
             _flag(
                 "--for-control",
-                help="a model to plan with: without the feedback of the controller "
-                "that flew, a memory of past rows and corrections by them",
+                help="learn a model to plan with: without the feedback of the "
+                "controller that flew, memory of past rows and corrections by them",
             ),
-            _flag("--partial", help="read unfinished files as far as they are whole"),
+            _flag("--partial", help="read what is whole of unfinished files"),
         ],
     ),
     "log": Subcommand(
-        "Shows, rescues or exports a recording, writes its layout, inspects logs",
+        "Shows, recovers or exports a recording, writes its layout, inspects logs",
         module="_log",
         arguments=[
             _argument(
                 "action",
                 choices=["info", "recover", "export", "layout", "inspect"],
-                help="info: channels, times, how the solves ended; recover: what is "
-                "whole in an unfinished file, as a new one; export: the steps as a "
-                "table, a row each; layout: for Foxglove or Lichtblick, fitting the "
-                "recording; inspect: rates, gaps, repeated values, noise, delays and "
-                "excitation of any log, on one page",
+                help="info: print channels, times and how the solves ended; recover: "
+                "copy what is whole of an unfinished file; export: write a table with "
+                "a row per step; layout: write a layout for Foxglove or Lichtblick; "
+                "inspect: write a page on any log (rates, gaps, repeats, noise, "
+                "delays, excitation)",
             ),
             _argument(
                 "file",
                 type=Path,
-                help="an MCAP file, finished or not; inspect: any log",
+                help="MCAP file, finished or not; inspect: any log",
             ),
             _argument(
                 "output",
                 type=Path,
                 nargs="?",
-                help="where it goes; FILE with .recovered.mcap, .csv (or .parquet), "
-                ".layout.json, .inspection.html",
+                help="file to write; .csv or .parquet of export (FILE with "
+                ".recovered.mcap, .csv, .layout.json or .inspection.html)",
             ),
             _argument(
                 "--mapping",
                 type=Path,
-                help="inspect: a YAML file that says what the columns mean",
+                help="inspect: YAML file that says what the columns mean",
             ),
             _argument(
                 "--time",
                 default="",
                 metavar="COLUMN",
-                help="inspect, without a mapping: the column of the times [s], by name "
-                "or number",
+                help="inspect, without a mapping: column of the times [s], by name or "
+                "number",
             ),
             _argument(
                 "--time-step",
                 type=float,
                 metavar="SECONDS",
-                help="inspect, without a mapping: the constant step of rows that have "
-                "no times",
+                help="inspect, without a mapping: constant step of rows without times",
             ),
         ],
     ),
@@ -390,24 +389,24 @@ COMMANDS = {
         module="_warmup",
     ),
     "completion": Subcommand(
-        "Prints a script that completes a line at TAB",
+        "Prints a shell script that completes commands at TAB",
         module="_completion",
         arguments=[
             _argument(
                 "shell",
                 nargs="?",
                 choices=["bash", "zsh", "fish"],
-                help='for its profile: eval "$(gpmpc completion bash)"',
+                help='shell; put into its profile: eval "$(gpmpc completion bash)"',
             ),
             _argument(
                 "--line",
                 metavar="LINE",
-                help="print what may come next after this beginning of a line",
+                help="print the completions of this beginning of a line",
             ),
         ],
     ),
     "version": Subcommand(
-        "Prints the versions of what computes, and the processor", module="_version"
+        "Prints versions, the BLAS library and the processor", module="_version"
     ),
     "help": Subcommand(
         "Explains a command",
