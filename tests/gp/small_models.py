@@ -2,8 +2,9 @@
 
 import torch
 
-from gpmpc.gp import GPPosterior, _storage, load_posterior, save_posterior
+from gpmpc.gp import GPPosterior, load_posterior, save_posterior
 from gpmpc.models import Affine, ResidualModel, load_model, save_model
+from tests.gp.model_files import parts_of, write_npz
 
 SAVE = {GPPosterior: save_posterior, ResidualModel: save_model}
 LOAD = {GPPosterior: load_posterior, ResidualModel: load_model}
@@ -44,7 +45,7 @@ def as_before(model, path):
     """
     new = path.with_suffix(".new")
     SAVE[type(model)](model, new)
-    header, arrays = _storage._content(new, "model")
+    header, arrays = parts_of(new)
     header = {
         key: value
         for key, value in header.items()
@@ -56,4 +57,4 @@ def as_before(model, path):
         for name, array in arrays.items()
         if not name.endswith("observation_noise")
     }
-    path.write_bytes(_storage.write_npz(header | {"format_version": 1}, arrays))
+    write_npz(path, header | {"format_version": 1}, arrays)

@@ -1,7 +1,6 @@
 """Models on disk: what is loaded predicts what was saved bit by bit, and no damage goes
 unnoticed or untold."""
 
-import json
 import subprocess
 import sys
 from dataclasses import fields, replace
@@ -17,15 +16,13 @@ from gpmpc.gp import (
     GPPosterior,
     Trainer,
     Transitions,
-    _storage,
     load_metadata,
     load_posterior,
     save_posterior,
 )
-from gpmpc.gp._kernel import Hyperparameters
-from gpmpc.gp._sparse import sparse_posterior
 from gpmpc.models import ResidualModel, linearize, save_model
 from gpmpc.signals import Signals
+from tests.gp.model_files import parts_of, write
 from tests.gp.small_models import LOAD, SAVE, as_before, posterior, residual_model
 
 
@@ -166,12 +163,14 @@ def test_what_targets_are_stays_known(dtype, tmp_path):
     assert torch.allclose(loaded.observation_noise.double(), learned)
     assert torch.allclose(loaded.noise_variance.double(), learned / 2)
 
-    hyperparameters = Hyperparameters(gp.lengthscales, gp.signal_variance, learned)
-    for points in (1, 12):  # a pseudo-observation of one point is noisier than a row
-        sparse = sparse_posterior(
-            gp.features[:points], gp.features, gp.targets, hyperparameters, input_dim=1
-        ).to(dtype=torch.float32)
-        save_posterior(sparse, tmp_path / "gp.safetensors")
+    for points in (1, 12):
+        kernel = (gp.lengthscales, gp.signal_variance, 4 * learned)
+        of_points = GPPosterior.from_hyperparameters(
+            gp.features[:points], gp.targets[:points], *kernel, input_dim=1
+        )
+        # as SparseTrainer makes them; a pseudo-observation may be noisier than a row
+        sparse = replace(of_points, noise_variance=learned, observation_noise=None)
+        save_posterior(sparse.to(dtype=torch.float32), tmp_path / "gp.safetensors")
         loaded = load_posterior(tmp_path / "gp.safetensors").to(dtype=dtype)
         with pytest.raises(UnsupportedModel, match="pseudo-observations"):
             Trainer().refit(loaded)
@@ -287,13 +286,12 @@ def test_a_flipped_bit_in_the_data_is_refused(tmp_path):
 def rewritten(path, header=None, **arrays):
     """The file with other header entries and arrays (None drops one), and a valid
     checksum."""
-    said, parts = _storage._content(path, "model")
+    said, parts = parts_of(path)
     said = said | (header or {})
     parts = {
         name: value for name, value in (parts | arrays).items() if value is not None
     }
-    said["checksum"] = _storage._checksum(said, parts)
-    safetensors.numpy.save_file(parts, path, {"gpmpc": json.dumps(said)})
+    write(path, said, parts)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import torch
 
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gp import Transitions
-from gpmpc.gp._storage import write_npz
+from tests.gp.model_files import write_npz
 
 ROW = " ".join(str(float(i)) for i in range(15))
 
@@ -137,7 +137,7 @@ def test_a_newer_or_another_format_is_named(transitions, tmp_path, header, messa
         for name in ("states", "inputs", "next_states")
     }
     usual = {"format": "gpmpc transitions", "format_version": 1}
-    path.write_bytes(write_npz(usual | header, arrays))
+    write_npz(path, usual | header, arrays)
     with pytest.raises(DataError, match=rf"data\.npz: {message}"):
         Transitions.load(path)
 

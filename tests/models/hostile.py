@@ -8,7 +8,6 @@ and every array may hold anything. What is loaded predicts; everything else is a
 """
 
 import copy
-import json
 import math
 import random
 import resource
@@ -20,13 +19,10 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-import safetensors
-import safetensors.numpy
 import torch
 
 from gpmpc import systems
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.gp import _storage
 from gpmpc.gp.casadi_ import successor_function
 from gpmpc.logs import IdentifiedModel, load_flyable, load_learned, save_learned
 from gpmpc.logs._fitting import NominalFit
@@ -49,6 +45,7 @@ from gpmpc.models._log_dynamics import TIME_CONSTANTS, OutputNoise, TubeNoise
 from gpmpc.models._log_model import OutputGP
 from gpmpc.models._parametric import AffineNominal
 from gpmpc.models._state_space import StateGroup, StateSpace
+from tests.gp.model_files import parts_of, write
 from tests.gp.small_models import posterior, residual_model
 
 MEMORY = 300 * 2**20
@@ -185,20 +182,6 @@ KINDS = {
     "pendulum log": (of_a_pendulum_log, save_learned, load_log_model),
     "quadrotor log": (of_a_quadrotor_log, save_learned, load_to_fly),
 }
-
-
-def parts_of(path):
-    """The header and the arrays of a model file."""
-    with safetensors.safe_open(path, framework="numpy") as file:
-        arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return json.loads(file.metadata()["gpmpc"]), arrays
-
-
-def write(path, header, arrays):
-    """Writes a model file whose checksum is right, whatever is in it."""
-    arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    signed = header | {"checksum": _storage._checksum(header, arrays)}
-    path.write_bytes(safetensors.numpy.save(arrays, {"gpmpc": json.dumps(signed)}))
 
 
 VALUES = [

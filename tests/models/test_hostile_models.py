@@ -1,25 +1,24 @@
 """Crafted models with right checksums import nothing; errors are one line."""
 
 import copy
-import json
 import sys
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import safetensors.numpy
 import torch
 
 from gpmpc.exceptions import DataError, SettingError
-from gpmpc.gp import Transitions, _storage
+from gpmpc.gp import Transitions
 from gpmpc.gp.casadi_ import function_of_tape
 from gpmpc.logs import load_flyable, load_learned
 from gpmpc.models import DelayedModel, ResidualModel, load_model, save_model
 from tests.cli.command import copied_process
+from tests.gp.model_files import content_of, parts_of, write
 from tests.gp.small_models import posterior, residual_model
 from tests.models import hostile
-from tests.models.hostile import parts_of, with_code, with_operations, write
+from tests.models.hostile import with_code, with_operations
 
 CANARY = "canary_of_the_models"
 
@@ -78,8 +77,7 @@ def six_hostile_models(good, canary):
         whole["memory_order"] = {
             f"{prefix}{key}": order for key, order in header["memory_order"].items()
         }
-        signed = whole | {"checksum": _storage._checksum(whole, own)}
-        contents[name] = safetensors.numpy.save(own, {"gpmpc": json.dumps(signed)})
+        contents[name] = content_of(whole, own)
     return contents
 
 
@@ -149,7 +147,7 @@ def test_code_of_a_trusted_package_is_loaded(saved):
         "tests.models.hostile:subprocess.call",
         "tests.models.hostile:np.save",
         "tests:nothing",
-        "tests.models.hostile:json.dumps",
+        "tests.models.hostile:copy.deepcopy",
         "tests.models.hostile:load_model",
     ],
 )
@@ -364,7 +362,7 @@ def test_outputs_without_a_nominal_model_need_no_memory(tmp_path):
 
 @pytest.mark.parametrize("field", ["nominal", "kinematics"])
 def test_an_unknown_name_in_a_log_model_is_refused(tmp_path, field):
-    from gpmpc.logs._storage import save_learned
+    from gpmpc.logs import save_learned
     from tests.models.hostile import of_a_quadrotor_log
 
     path = tmp_path / "m.safetensors"
