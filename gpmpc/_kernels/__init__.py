@@ -30,7 +30,7 @@ from gpmpc._kernels._gp_point import (
     kernel_rows,
     linearize_points,
 )
-from gpmpc._kernels._packed import Array, GPArrays, Packed, as_doubles, pack
+from gpmpc._kernels._packed import Array, GPArrays, Packed, pack
 from gpmpc._kernels._window import Window
 from gpmpc.exceptions import SettingError, ShapeError
 
@@ -108,9 +108,9 @@ def linearize_gps(
             not one a state.
         SettingError: A window has no points, or a row of its factor is missing.
     """
-    x = as_doubles(x)
-    u = as_doubles(u)
-    offset = as_doubles(offset)
+    x = np.ascontiguousarray(x, dtype=np.float64)
+    u = np.ascontiguousarray(u, dtype=np.float64)
+    offset = np.ascontiguousarray(offset, dtype=np.float64)
     H = len(x)
     k = len(packed.arrays.weights)
     n = packed.state_dim

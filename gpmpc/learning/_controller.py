@@ -81,7 +81,7 @@ class LearningController:
     ) -> Decision:
         """Learns from the last step, and decides; see ``GPMPC.control``."""
         start = perf_counter()
-        check_arguments(belief, reference)
+        check_arguments(belief, reference, previous)
         if belief.names:
             belief = belief.in_order(self.signals.state_names)
         measured = to_array(belief.mean).copy()

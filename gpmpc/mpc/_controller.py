@@ -427,10 +427,7 @@ class Request(NamedTuple):
             ShapeError: See ``GPMPC.control``.
             DataError: Likewise.
         """
-        check_arguments(belief, reference)
-        if previous is not None:
-            rule = "the last Decision, or None at the first step"
-            check_kind("previous", previous, Decision, rule)
+        check_arguments(belief, reference, previous)
         if belief.names:
             belief = belief.in_order(signals.state_names)
         if reference.signals is not UNKNOWN:
@@ -584,14 +581,22 @@ def continued_means(previous: Decision, state: Array, angles: Sequence[int]) -> 
     return means
 
 
-def check_arguments(belief: Any, reference: Any) -> None:
-    """Raises ``ShapeError`` unless these are what ``control`` takes."""
+def check_arguments(belief: Any, reference: Any, previous: Any) -> None:
+    """Checks the kinds of the arguments of ``control``.
+
+    Raises:
+        ShapeError: Belief or reference are of another kind.
+        SettingError: The last decision is.
+    """
     if not (isinstance(belief, Gaussian) and isinstance(reference, Reference)):
         raise ShapeError(
             "control takes a Gaussian (Gaussian.certain(x) for a measured state) "
             "and a Reference(states); "
             f"got {type(belief).__name__} and {type(reference).__name__}"
         )
+    if not (previous is None or isinstance(previous, Decision)):
+        rule = "the last Decision, or None at the first step"
+        check_kind("previous", previous, Decision, rule)
 
 
 def check_controller(

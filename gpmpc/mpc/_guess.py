@@ -64,7 +64,10 @@ def read_request(
         request = request._replace(parameters=read_parameters(parameters, horizon))
     if plan is not None and prediction.is_held:
         raise SettingError("plan", "is not taken by a form that linearises one point")
-    _check_kappas(prediction, request)
+    covariance_mode = prediction.settings.covariance
+    if request.kappas is not None and covariance_mode != "zero_order":
+        rule = "are for covariances of 'zero_order'"
+        raise SettingError("kappas", f"{rule}; this controller has {covariance_mode!r}")
     if prediction.settings.disturbance_gain:
         disturbance = _estimate_disturbance(prediction, request, previous)
         request = request._replace(disturbance=disturbance)
@@ -98,14 +101,6 @@ def _turned_towards(
     angles = prediction.problem.cost.angle_indices
     turned = targets + full_turns(states[1:] - targets, angles)
     return request._replace(references=request.references._replace(states=turned))
-
-
-def _check_kappas(prediction: PredictionModel, request: Request) -> None:
-    """Raises ``SettingError`` where a reference has kappas without a use."""
-    mode = prediction.settings.covariance
-    if request.kappas is not None and mode != "zero_order":
-        rule = "are for covariances of 'zero_order'"
-        raise SettingError("kappas", f"{rule}; this controller has {mode!r}")
 
 
 def _estimate_disturbance(
@@ -242,7 +237,7 @@ def is_contradicted(guess: Plan, stages: Stages, ranges: Array) -> bool:
         stages: Linearised along it.
         ranges: Of the states in the model's data (n,), infinite where they are unknown.
     """
-    return _leads_away(stages.next, stages.A, stages.B, guess.states, ranges)
+    return _leads_away.unchecked(stages.next, stages.A, stages.B, guess.states, ranges)
 
 
 @compiled

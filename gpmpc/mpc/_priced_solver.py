@@ -58,7 +58,9 @@ class PricedSolver:
         self.row_prices = constraints.prices
         # Rows that may get their exact price back, once a step (r,). Along the last
         # plan none may: there the price was found by rolling the model out.
-        self._may_be_restored = constraints.elastic & (not request.continues_last_plan)
+        self._may_be_restored = constraints.elastic
+        if constraints.any_elastic and request.continues_last_plan:
+            self._may_be_restored = np.zeros_like(constraints.elastic)
 
     def look_again(self) -> None:
         """Lets the next program price its elastic rows, since a promise was broken.
@@ -138,7 +140,7 @@ class PricedSolver:
             restored = exact_solution
         if not restored.status.solved:
             return solution
-        self._may_be_restored &= ~is_kept
+        self._may_be_restored = self._may_be_restored & ~is_kept
         self.row_prices = restored_prices
         return restored
 

@@ -373,7 +373,7 @@ class ManyStarts:
         parameters: Any = None,
     ) -> Decision:
         """Decides the input for one step; see ``Controller.control``."""
-        check_arguments(belief, reference)
+        check_arguments(belief, reference, previous)
         belief = belief.in_order(self.signals.state_names)
         reference = reference.in_order(self.signals).over(self.horizon)
         state = to_array(belief.mean)
