@@ -1,6 +1,8 @@
-"""Sources of transitions.
+"""Sources of transitions to learn from.
 
-They are random inputs, our own flights, dithered flights, and the authors' files.
+``RandomData`` steps a system under random inputs. ``ExcitedData`` flies the quadrotor
+with dithered inputs, ``NMPCData`` flies it as in the paper's experiment, and
+``PaperData`` reads the files that the paper's authors published.
 """
 
 from gpmpc.datasets._flights import (

@@ -1,6 +1,9 @@
-"""Estimation of what is not measured: states, disturbances, delays and noise.
+"""Estimates what is not measured: states, disturbances, delays and noise.
 
-Conformal tubes say how far predictions can be believed.
+``KalmanFilter`` filters with any model and propagator, and ``smooth`` smooths a log.
+``estimate_delay``, ``estimate_process_noise``, ``estimate_varying_noise`` and
+``separate_noise`` find in a log what a model has to know. ``ConformalTube`` and
+``AdaptiveTube`` say how far predictions can be believed.
 """
 
 from gpmpc.estimation._conformal import AdaptiveTube, ConformalTube

@@ -1,1 +1,1 @@
-"""Published results, one module each: the claim, its trials and its tables."""
+"""The published results: their claims, trials and tables, one module for each."""

@@ -1,4 +1,9 @@
-"""Controllers as C: one header and one source that decide as Python does."""
+"""Controllers as C: one header and one source that decide as Python does.
+
+``export_c`` writes the code, ``write_replay`` what it is checked with, and
+``choose_points`` finds how many training points a chip holds. ``CompiledController``
+and ``CompiledLoop`` compile the code and call it from Python.
+"""
 
 from gpmpc.export._binding import CompiledController, CompiledLoop, compiled_controller
 from gpmpc.export._chip import Footprint, measure_footprint

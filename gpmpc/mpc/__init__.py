@@ -2,10 +2,10 @@
 
 ``Problem`` says what a controller makes small (``Tracking``, ``LeastSquares``) and what
 it keeps (``Box``, ``Halfspaces``, ``Inequality``). ``GPMPC`` decides by a learned model
-and a propagator of ``gpmpc.propagation``: its ``control`` returns a ``Decision``.
-``ControlLoop`` calls a controller at every step, acts where a decision fails, and judges
-the flight. ``ManyStarts`` searches plans from many first guesses, as for a swing-up.
-Other controllers to compare with are in ``gpmpc.mpc.baselines``.
+and a propagator of ``gpmpc.propagation``; its ``control`` returns a ``Decision``.
+``ControlLoop`` calls a controller at every step, acts where a decision fails, and
+judges the flight. ``ManyStarts`` searches plans from many first guesses, as for a
+swing-up. Other controllers to compare with are in ``gpmpc.mpc.baselines``.
 """
 
 from gpmpc.mpc._controller import Controller, Decision, Reference, Request, Timing

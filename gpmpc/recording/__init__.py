@@ -1,11 +1,14 @@
 """Recordings of runs in MCAP files: writing, live view, reading, replaying, recovering.
 
-Written by ``_recorder`` into ``_sink``: a step is copied and encoded (``_encoding``) as
-messages (``_schema``), and drawn (``_scene``). Read by ``_read_run``: the bytes of the
-file are taken apart (``_frames``, ``_index``), what is whole is found behind damage
-(``_records``, ``_chunk_search``) and sorted (``_content``), then decoded
-(``_decoding``) to a ``Run`` (``_run``). ``_recovery`` writes what is whole to a new
-file.
+``McapRecorder`` records the steps of a flight, ``read_run`` reads a file as a ``Run``,
+``replay`` solves the program of a recorded step again, and ``recover`` writes what is
+whole of a damaged file to a new one.
+
+How a step is written: ``_recorder`` copies it, ``_encoding`` makes messages of it
+(``_schema``), ``_scene`` draws it, and ``_sink`` writes the file. How a file is read:
+``_read_run`` takes its bytes apart (``_frames``, ``_index``), finds what is whole
+behind damage (``_records``, ``_chunk_search``), sorts it (``_content``), and decodes it
+(``_decoding``) to a ``Run`` (``_run``).
 
 To record one more number of a step, add
 

@@ -1,7 +1,9 @@
-"""Closed loops of a controller and a plant or a model.
+"""Closed loops of a controller and a plant, or of a controller and a learned model.
 
-With noise, disturbances and many seeds. None of them filters: a filter is a
-``Controller`` of one's own around a ``GPMPC``, as ``FilteredControl`` of
+``closed_loop`` flies once, ``closed_loops`` many seeds at the same time, and
+``cascade_loop`` two controllers at two rates. Noise and disturbances are arguments. The
+result is a ``Rollout``. None of these loops filters: a filter is a ``Controller`` of
+your own around a ``GPMPC``, as ``FilteredControl`` of
 ``benchmarks/disturbance_states.py`` is.
 """
 

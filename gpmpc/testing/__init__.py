@@ -1,6 +1,6 @@
-"""Checks of your own models, propagators and QP solvers.
+"""Checks models, propagators and QP solvers of your own.
 
-They hold them against the protocols that the rest of gpmpc relies on.
+They are held against what the rest of gpmpc relies on.
 """
 
 from gpmpc.testing._model import check_model
