@@ -1,4 +1,4 @@
-"""Draws results as figures and animations; only this package imports matplotlib.
+"""Draws results as figures and animations, with matplotlib.
 
 Every function returns a ``Figure`` made without pyplot, so nothing global is touched
 and no window opens.
