@@ -24,7 +24,12 @@ from gpmpc.logs._mapping import LogMapping
 from gpmpc.logs._run_tables import RunTable, tabulate
 from gpmpc.logs._runs import split_into_runs
 from gpmpc.logs._time_step import find_time_step
-from gpmpc.logs._usable_rows import UNCHANGING, least_motion, select_rows
+from gpmpc.logs._usable_rows import (
+    UNCHANGING,
+    is_settled_at_rest,
+    least_motion,
+    select_rows,
+)
 
 MOST_UNLIKE_SPREAD = 30.0  # of two entries of one signal
 FEWEST_SHARED = 20  # rows: a few begin alike by chance
@@ -75,10 +80,11 @@ def read_log(
     rest_ranges = least_motion(
         [mapping.split(table.values).states for table in tables], step
     )
+    settles = is_settled_at_rest(tables, step, rest_ranges, mapping)
     runs = []
     for table in tables:
         run_findings = RunFindings(table.name, findings)
-        run = select_rows(table, step, rest_ranges, mapping, run_findings)
+        run = select_rows(table, step, rest_ranges, settles, mapping, run_findings)
         if run is not None:
             runs.append(run)
     _check_unchanging(runs, findings)

@@ -20,6 +20,9 @@ from gpmpc.logs._run_tables import RunTable
 from gpmpc.logs._time_step import LONG_STEP, SHORT_STEP
 
 REST_TIME = 0.5  # [s] for which nothing moves at rest
+# Rows for which nothing moves at rest, at least: what settles for fewer, after a step
+# of an input, is a response, and would fall into pieces without them.
+REST_ROWS = 50
 REST_SHARE = 0.1  # of a state's usual motion that counts as no movement
 USUAL_MOTION = 0.9  # quantile of the ranges within ``REST_TIME``
 # Share of the rows; beyond, a signal has another rate than its table. At half the rate
@@ -50,10 +53,49 @@ def least_motion(states: Sequence[Array], step: float) -> Array:
     return REST_SHARE * np.minimum(spread, usual)
 
 
+def is_settled_at_rest(
+    tables: Sequence[RunTable], step: float, rest_ranges: Array, mapping: LogMapping
+) -> bool:
+    """Returns whether states rest at other values where inputs rest at other ones.
+
+    So does a process that settles after every step of an input: rows at rest tell its
+    gain. A vehicle that waits is at rest whatever its steering is. Systems whose
+    physics the mapping names have states that no input holds, such as a position.
+
+    Args:
+        tables: Of all runs.
+        step: Time step of the log [s].
+        rest_ranges: Up to which states do not move (n,); see ``least_motion``.
+        mapping: Of the log.
+    """
+    if mapping.model != "none":
+        return False
+    states_at_rest = []
+    inputs_at_rest = []
+    for table in tables:
+        values = mapping.split(table.values)
+        at_rest = _at_rest(values.states, values.inputs, rest_ranges, step)
+        at_rest &= ~np.isnan(table.values).any(axis=1)
+        states_at_rest.append(values.states[at_rest])
+        inputs_at_rest.append(values.inputs[at_rest])
+    states = np.concatenate(states_at_rest)
+    inputs = np.concatenate(inputs_at_rest)
+    if not len(states):
+        return False
+    groups = np.unique(inputs, axis=0, return_inverse=True)[1].ravel()
+    counts = np.bincount(groups)
+    means = np.stack(
+        [np.bincount(groups, column) / counts for column in states.T], axis=-1
+    )
+    within = np.sqrt(np.square(states - means[groups]).mean(axis=0))
+    return bool((np.ptp(means, axis=0) > np.maximum(rest_ranges, within)).any())
+
+
 def select_rows(
     table: RunTable,
     step: float,
     rest_ranges: Array,
+    settles: bool,
     mapping: LogMapping,
     findings: RunFindings,
 ) -> LogRun | None:
@@ -63,6 +105,7 @@ def select_rows(
         table: Of the run.
         step: Time step of the log [s].
         rest_ranges: Up to which states do not move (n,); see ``least_motion``.
+        settles: Whether rows at rest are kept; see ``is_settled_at_rest``.
         mapping: Says what is left out.
         findings: Of the run, which takes what is left out.
 
@@ -75,8 +118,15 @@ def select_rows(
     rows.leave_out(table.outside_keep, "outside of keep", "outside the ranges of keep")
     if mapping.rest == "drop":
         at_rest = _at_rest(values.states, values.inputs, rest_ranges, step)
-        text = "where nothing moves (rest: use keeps them)"
-        rows.leave_out(at_rest, "at rest", text)
+        if settles:
+            text = (
+                f"{at_rest.sum()} of {len(at_rest)} rows where nothing moves: states "
+                "rest at other values for other inputs, which tells the gain; left in"
+            )
+            findings.add("settled", at_rest.sum(), text)
+        else:
+            text = "where nothing moves (rest: use keeps them)"
+            rows.leave_out(at_rest, "at rest", text)
     is_missing = np.asarray(np.isnan(table.values).any(axis=1))
     rows.leave_out(is_missing, "missing value", "in a gap or without a value")
     fault = _leave_out_held_values(rows, values.states, mapping)
@@ -236,8 +286,12 @@ def _note_gaps(
 
 def _ranges_of_rest_time(states: Array, step: float) -> Array:
     """Returns the ranges of states (K, n) within ``REST_TIME`` around each row."""
-    size = min(max(round(REST_TIME / step), 3), len(states))
-    return _range_within(states, size)
+    return _range_within(states, min(_rest_rows(step), len(states)))
+
+
+def _rest_rows(step: float) -> int:
+    """Returns the rows, an odd number, for which nothing moves at rest."""
+    return 2 * (max(round(REST_TIME / step), REST_ROWS) // 2) + 1
 
 
 def _at_rest(
@@ -247,16 +301,17 @@ def _at_rest(
 
     ``rest_ranges`` are those (n,) up to which states do not; see ``least_motion``.
     """
-    size = max(round(REST_TIME / step), 3)
+    size = _rest_rows(step)
     if len(states) < size or not inputs.shape[1]:
         return np.zeros(len(states), dtype=bool)
     limit = np.concatenate([rest_ranges, np.zeros(inputs.shape[1])])
     values = np.concatenate([states, inputs], axis=1)
     is_still = (_range_within(values, size) <= limit).all(axis=1)
+    is_still[: size // 2] = False  # the window begins before the run
+    is_still[len(is_still) - size // 2 :] = False
     # A maximum takes the same time for any size, a dilation by the rows of one second
     # of a fast plant minutes.
-    around = 2 * (size // 2) + 1
-    return maximum_filter1d(is_still.astype(np.uint8), around, mode="constant") > 0
+    return maximum_filter1d(is_still.astype(np.uint8), size, mode="constant") > 0
 
 
 def _range_within(values: Array, size: int) -> Array:

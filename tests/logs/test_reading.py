@@ -541,6 +541,44 @@ def test_parts_at_rest_are_left_out_unless_asked_for(tmp_path):
         read_log(written(tmp_path, standing), PENDULUM)
 
 
+def settled(drive, rows_of_time_constant, resolution):
+    """Returns a first-order response to a drive, in steps of a resolution."""
+    state = np.zeros(len(drive))
+    for k in range(1, len(drive)):
+        state[k] = state[k - 1] + (drive[k - 1] - state[k - 1]) / rows_of_time_constant
+    return resolution * np.round(state / resolution)
+
+
+def test_what_settles_after_steps_of_an_input_is_no_rest(tmp_path):
+    rng = np.random.default_rng(0)
+    levels = rng.uniform(-1, 1, 8)
+    # Time step [s], rows of a level, of the time constant, resolution, rows at rest.
+    cases = (
+        (1.0, 200, 40, 0.02, 850),  # a heater, whose sensor repeats its values
+        (0.1, 50, 5, 1e-6, 0),  # a motor
+        (0.01, 300, 20, 1e-6, 2000),  # a fast one
+    )
+    mapping = {"time": "t", "states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
+    for step, rows, rows_of_time_constant, resolution, rests in cases:
+        drive = np.repeat(levels, rows)
+        state = settled(drive, rows_of_time_constant, resolution)
+        columns = {"t": step * np.arange(len(drive)), "x": state, "u": drive}
+        log = read_log(written(tmp_path, pandas.DataFrame(columns)), mapping)
+        assert len(log) == len(drive)
+        assert log.longest_piece == len(drive)
+        assert kinds(log).get("settled", 0) == pytest.approx(rests, abs=100)
+    # What waits is at rest for every input that moves nothing.
+    waits = np.repeat([True, False, True, False, True], 300)
+    steering = np.repeat([0.0, 0.2, 0.4, -0.1, -0.3], 300)
+    throttle = np.where(waits, 0.0, 1 + 0.1 * rng.standard_normal(1500))
+    speed = settled(throttle, 20, 1e-6)
+    table = pandas.DataFrame(
+        {"t": 0.01 * np.arange(1500), "v": speed, "s": steering, "a": throttle}
+    )
+    mapping = {"time": "t", "states": {"v": ["v"]}, "inputs": {"u": ["s", "a"]}}
+    assert 600 < kinds(read_log(written(tmp_path, table), mapping))["at rest"] <= 900
+
+
 def test_euler_angles_make_quaternions_without_jumps(tmp_path):
     table = body_table()
     yaw = np.linspace(2, 12, 300)
