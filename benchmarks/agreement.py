@@ -84,20 +84,18 @@ def optimality(
     times = [[], []]
     failed = {"convex": 0, "slsqp": 0}
     for trajectory, gp in posteriors.items():
-        asked = (problem(), arguments.horizon, HOVER)
+        task = (problem(), arguments.horizon, HOVER)
         convex = GPMPC(
             gp,
             propagator,
-            *asked,
+            *task,
             prediction=PredictionSettings(form="trajectory", covariance="full"),
             iterations=100,
             tolerance=1e-7,
         )
-        slsqp = SLSQP(gp, propagator, *asked, tolerance=1e-6)
+        slsqp = SLSQP(gp, propagator, *task, tolerance=1e-6)
         count = arguments.steps // len(posteriors)
-        flown = recorded(
-            GPMPC(gp, Linearization(), *asked), trajectory, count, std=0.01
-        )
+        flown = recorded(GPMPC(gp, Linearization(), *task), trajectory, count, std=0.01)
         for step in flown:
             plans = []
             for controller, spent in zip((convex, slsqp), times, strict=True):
@@ -136,9 +134,11 @@ def optimality(
 
 def solvers(posteriors: dict, count: int) -> dict:
     """Inputs by several solvers and forms on one program."""
-    found = {name: [] for name in ("primal_active_set", "clarabel", "state_form")}
+    inputs_by_solver = {
+        name: [] for name in ("primal_active_set", "clarabel", "state_form")
+    }
     active = 0
-    unsolved = dict.fromkeys(found, 0)
+    unsolved = dict.fromkeys(inputs_by_solver, 0)
     for trajectory, gp in posteriors.items():
         # Bounds that bite: of the inputs and their increments, and of positions.
         bounds = Box(
@@ -153,21 +153,19 @@ def solvers(posteriors: dict, count: int) -> dict:
             HOVER,
         )
         soft = (problem(bounds), 10, HOVER)
-        for asked, kinds, steps in (
-            (hard, tuple(found), count // 2),
+        for task, kinds, steps in (
+            (hard, tuple(inputs_by_solver), count // 2),
             (soft, ("state_form",), count // 4),
         ):
-            ours = GPMPC(gp, Linearization(), *asked)
+            ours = GPMPC(gp, Linearization(), *task)
             others = {
-                "primal_active_set": lambda a=asked, g=gp: GPMPC(
+                "primal_active_set": lambda a=task, g=gp: GPMPC(
                     g, Linearization(), *a, solver=PrimalActiveSet()
                 ),
-                "clarabel": lambda a=asked, g=gp: GPMPC(
+                "clarabel": lambda a=task, g=gp: GPMPC(
                     g, Linearization(), *a, solver=CvxpySolver()
                 ),
-                "state_form": lambda a=asked, g=gp: StateFormMPC(
-                    g, Linearization(), *a
-                ),
+                "state_form": lambda a=task, g=gp: StateFormMPC(g, Linearization(), *a),
             }
             others = {kind: others[kind]() for kind in kinds}
             for step in recorded(ours, trajectory, steps):
@@ -179,7 +177,7 @@ def solvers(posteriors: dict, count: int) -> dict:
                         step.belief, step.reference, step.previous
                     )
                     if again.status.solved:
-                        found[kind].append(
+                        inputs_by_solver[kind].append(
                             float(np.abs(again.inputs - step.decision.inputs).max())
                         )
                     else:
@@ -192,7 +190,7 @@ def solvers(posteriors: dict, count: int) -> dict:
             "median": float(np.median(gaps)),
             "largest": max(gaps),
         }
-        for kind, gaps in found.items()
+        for kind, gaps in inputs_by_solver.items()
     } | {"steps_with_active_bounds": active}
     print(f"solvers: {result}", flush=True)
     return result

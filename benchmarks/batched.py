@@ -96,23 +96,29 @@ def measured(
         "steps": arguments.steps,
         "noise": NOISE,
     }
-    here = GPMPC(gp, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode)
-    there = here
+    host_controller = GPMPC(
+        gp, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode
+    )
+    device_controller = host_controller
     if arguments.device != "cpu":
-        moved = gp.to(arguments.device)
-        there = GPMPC(
-            moved, problem=problem(), horizon=HORIZON, initial_input=HOVER, **mode
+        gp_on_device = gp.to(arguments.device)
+        device_controller = GPMPC(
+            gp_on_device,
+            problem=problem(),
+            horizon=HORIZON,
+            initial_input=HOVER,
+            **mode,
         )
 
     def alone() -> float:
         flown = range(min(trials, arguments.alone))
         for seed in flown:
-            closed_loop(OUTER, here, **flight, seed=seed)
+            closed_loop(OUTER, host_controller, **flight, seed=seed)
         return trials / len(flown)
 
     def together(choice: str = "auto") -> float:
         with nullcontext() if choice == "auto" else backend(choice):
-            flown = closed_loops(OUTER, there, **flight, seeds=trials)
+            flown = closed_loops(OUTER, device_controller, **flight, seeds=trials)
         errors = {trial.error for trial in flown if trial.error}
         if errors:
             raise SystemExit(f"a flight failed: {errors}")
@@ -132,15 +138,15 @@ def measured(
             share = way()
             if repeat:  # the first compiles, or loads
                 seconds[name].append((clock() - began) * share)
-    taken = {name: np.array(values) for name, values in seconds.items()}
+    samples = {name: np.array(values) for name, values in seconds.items()}
     ratios = {
-        name: taken["alone"] / values
-        for name, values in taken.items()
+        name: samples["alone"] / values
+        for name, values in samples.items()
         if name != "alone"
     }
     return {
         "trials_per_second": {
-            name: trials / float(np.median(values)) for name, values in taken.items()
+            name: trials / float(np.median(values)) for name, values in samples.items()
         },
         "over_alone": {
             name: float(np.median(values)) for name, values in ratios.items()

@@ -97,7 +97,7 @@ def flights(
     )
     start = np.concatenate([references[0], np.zeros(6)])
     squares = []
-    lost = 0
+    losses = 0
     failures = 0
     outer = []
     inner = []
@@ -120,7 +120,7 @@ def flights(
             )
         except GpmpcError as error:
             print(f"lost: {error}")
-            lost += 1
+            losses += 1
             continue
         squares.append(
             tracking_error(
@@ -134,11 +134,11 @@ def flights(
         outer.append(flight.outer.seconds)
         inner.append(flight.inner.seconds)
     if not squares:
-        return {"rmse": float("nan"), "lost": lost}
+        return {"rmse": float("nan"), "lost": losses}
     return {
         "rmse": float(np.sqrt(np.mean(squares))),
         "worst": worst,
-        "lost": lost,
+        "lost": losses,
         "failures": failures,
         "outer_ms": 1e3 * float(np.median(np.concatenate(outer))),
         "inner_ms": 1e3 * float(np.median(np.concatenate(inner))),

@@ -517,8 +517,8 @@ def main() -> None:
                         fly(other, model, eta, quantile, plant.steps, 4).errors, eta
                     )
                 )
-            found = fly(plant, model, eta, quantile, plant.steps, arguments.seeds)
-            bad, active = found.violations, found.active
+            outcome = fly(plant, model, eta, quantile, plant.steps, arguments.seeds)
+            bad, active = outcome.violations, outcome.active
             limit = (
                 float(beta.ppf(0.95, bad + 1, active - bad)) if bad < active else 1.0
             )
@@ -526,15 +526,15 @@ def main() -> None:
             cell["code"] = code  # rows of other code stay beside those of this one
             numbers = {"violations": bad, "active": active, "upper_limit": limit}
             numbers |= {
-                "distance": found.distance,
-                "cost": float(np.mean(found.costs)),
-                "costs": found.costs,
+                "distance": outcome.distance,
+                "cost": float(np.mean(outcome.costs)),
+                "costs": outcome.costs,
             }
             results = [
                 row for row in results if row.items() & cell.items() != cell.items()
             ] + [cell | numbers]
             text = f"{allowed:9g}{100 * bad / max(active, 1):9.2f}"
-            text += f"{100 * limit:9.2f}{1e3 * found.distance:9.2f}"
+            text += f"{100 * limit:9.2f}{1e3 * outcome.distance:9.2f}"
             print(
                 f"{name:23}{way:26}{text}{numbers['cost']:9.4f}{active:9}", flush=True
             )

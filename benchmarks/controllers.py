@@ -89,31 +89,31 @@ def ways(gp: GPPosterior, horizon: int) -> list[dict]:
     each with the paper's form.
     """
     exact = MomentMatching(process_noise=False)
-    asked = (problem(), horizon, HOVER)
+    task = (problem(), horizon, HOVER)
     paper = {
         "paper's form": GPMPC(
             gp,
             exact,
-            *asked,
+            *task,
             prediction=PredictionSettings(form="velocity", covariance="full"),
         )
     }
     convex = {
-        "trajectory, linearised": GPMPC(gp, Linearization(), *asked),
+        "trajectory, linearised": GPMPC(gp, Linearization(), *task),
         "trajectory, mean": GPMPC(
             gp,
             Linearization(),
-            *asked,
+            *task,
             prediction=PredictionSettings(covariance="none"),
         ),
     }
     rivals = {}
     for start in ("", COLD):
         rivals[f"nonlinear, sqp{start}"] = NonlinearGPMPC(
-            gp, exact, *asked, iterations=300, tolerance=1e-6
+            gp, exact, *task, iterations=300, tolerance=1e-6
         )
-        rivals[f"nonlinear, slsqp{start}"] = SLSQP(gp, exact, *asked, tolerance=1e-6)
-    rivals[f"nonlinear, plain slsqp{COLD}"] = PlainSLSQP(gp, exact, *asked)
+        rivals[f"nonlinear, slsqp{start}"] = SLSQP(gp, exact, *task, tolerance=1e-6)
+    rivals[f"nonlinear, plain slsqp{COLD}"] = PlainSLSQP(gp, exact, *task)
     return [paper | convex, paper | rivals]
 
 
@@ -142,12 +142,18 @@ class PlainSLSQP(SLSQP):
         options = {"ftol": 1e-6 * cost, "maxiter": 300}
         gradient = {"jac": lambda U: at(U).gradient, "bounds": box, "options": options}
         result = minimize(lambda U: at(U).cost, start, method="SLSQP", **gradient)
-        found = at(result.x)
+        solution = at(result.x)
         status = Status.SOLVED if result.success else Status.ITERATION_LIMIT
         inputs = result.x.reshape(self.horizon, -1)
         spent = Timing(0.0, 0.0, time.perf_counter() - began)
         return Decision(
-            inputs[0], inputs, found.means, found.covariances, status, result.nit, spent
+            inputs[0],
+            inputs,
+            solution.means,
+            solution.covariances,
+            status,
+            result.nit,
+            spent,
         )
 
 
@@ -159,7 +165,7 @@ def measured(
         GPMPC(gp, Linearization(), problem(), horizon, HOVER), trajectory, steps, STD
     )
     exact = MomentMatching()
-    taken = {name: [] for name in ["jacobian", *controllers]}
+    milliseconds = {name: [] for name in ["jacobian", *controllers]}
     unsolved = dict.fromkeys(controllers, 0)
     last = dict.fromkeys(controllers)
     for count, step in enumerate(flown):
@@ -184,8 +190,8 @@ def measured(
             last[name] = decision
         if count >= 2:  # what is compiled or loaded at a first call is left out
             for name, seconds in spent.items():
-                taken[name].append(seconds)
-    times = {name: np.array(seconds) for name, seconds in taken.items()}
+                milliseconds[name].append(seconds)
+    times = {name: np.array(seconds) for name, seconds in milliseconds.items()}
     ours = times["paper's form"]
     result = {
         "trajectory": trajectory,

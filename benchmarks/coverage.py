@@ -182,12 +182,12 @@ def of_car(kind: str, flights: int, seed: int) -> Learned:
 def measured(rows: Transitions, deviations: list[float], seed: int) -> Transitions:
     """The same motion as noisy sensors show it."""
     rng = np.random.default_rng(500 + seed)
-    seen = []
+    columns_by_run = []
     for run in Recording.chained(rows):
         states = run.states.numpy()
         states = states + rng.normal(0.0, 1.0, states.shape) * deviations
-        seen.append((states[:-1], run.inputs.numpy(), states[1:]))
-    columns = [np.concatenate(parts) for parts in zip(*seen, strict=True)]
+        columns_by_run.append((states[:-1], run.inputs.numpy(), states[1:]))
+    columns = [np.concatenate(parts) for parts in zip(*columns_by_run, strict=True)]
     return Transitions(columns[0], columns[1], columns[2], rows.signals)
 
 
@@ -227,31 +227,33 @@ def main() -> None:
     parser.add_argument("plants", nargs="*", default=list(NOISES))
     parser.add_argument("--flights", type=int, default=4)
     parser.add_argument("--seeds", type=int, default=1)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     use_one_thread()
     console = Console(width=130)
     rows = []
     pooled: dict[tuple[str, str], list[np.ndarray]] = {}
-    for name in given.plants:
+    for name in arguments.plants:
         for kind in KINDS:
             by_seed: dict[str, list[np.ndarray]] = {}
-            for seed in range(given.seeds):
+            for seed in range(arguments.seeds):
                 if name == "car":
-                    learned = of_car(kind, given.flights, seed)
+                    learned = of_car(kind, arguments.flights, seed)
                 else:
-                    learned = of_gallery(name, kind, given.flights, seed)
-                for held, found in calibrations(learned).items():
-                    at = [step - 1 for step in STEPS if step <= found.horizon]
-                    by_seed.setdefault(held, []).append(
-                        found.coverage[at, :, 0].numpy()
+                    learned = of_gallery(name, kind, arguments.flights, seed)
+                for noise_kind, calibration in calibrations(learned).items():
+                    at = [step - 1 for step in STEPS if step <= calibration.horizon]
+                    by_seed.setdefault(noise_kind, []).append(
+                        calibration.coverage[at, :, 0].numpy()
                     )
-            for held, parts in by_seed.items():
+            for noise_kind, parts in by_seed.items():
                 coverage = np.mean(parts, axis=0)
-                pooled.setdefault((kind, held), []).append(coverage.mean(axis=1))
-                rows.append([name, kind, held, *map(cell, coverage)])
+                pooled.setdefault((kind, noise_kind), []).append(coverage.mean(axis=1))
+                rows.append([name, kind, noise_kind, *map(cell, coverage)])
                 console.out(*rows[-1], sep="  ", highlight=False)
-    for (kind, held), parts in pooled.items():
-        rows.append(["all", kind, held, *(f"{v:.2f}" for v in np.mean(parts, axis=0))])
+    for (kind, noise_kind), parts in pooled.items():
+        rows.append(
+            ["all", kind, noise_kind, *(f"{v:.2f}" for v in np.mean(parts, axis=0))]
+        )
     table = Table(["plant", "noise", "held", *(f"{k} ahead" for k in STEPS)], rows)
     console.print(terminal([table]))
 

@@ -122,9 +122,14 @@ def fly(
     for k in range(course.steps):
         measured = state + sensors * generator.normal(size=len(state))
         ahead = course.references[k : k + horizon + 1]
-        known = None if parameters is None else parameters[k + 1 : k + horizon + 1]
+        parameters_ahead = (
+            None if parameters is None else parameters[k + 1 : k + horizon + 1]
+        )
         decision = controller.control(
-            Gaussian.certain(measured), Reference(ahead), decision, parameters=known
+            Gaussian.certain(measured),
+            Reference(ahead),
+            decision,
+            parameters=parameters_ahead,
         )
         input = np.clip(decision.input, problem.inputs.lower, problem.inputs.upper)
         state = step(course.system, state, input)

@@ -125,25 +125,25 @@ def main() -> None:
                 fly(model, delay, believed, moved, seed, arguments.steps)
                 for seed in range(arguments.seeds)
             ]
-            kept = [
+            completed = [
                 errors if moved else errors[SECOND:]
                 for errors in flown
                 if errors is not None
             ]
             rmse = (
-                np.sqrt(np.mean(np.concatenate(kept) ** 2, axis=0))
-                if kept
+                np.sqrt(np.mean(np.concatenate(completed) ** 2, axis=0))
+                if completed
                 else np.full(2, np.nan)
             )
             against = rmse if name == "no delay" else against
-            (cart, angle), (one, other), lost = (
+            (cart, angle), (one, other), losses = (
                 rmse,
                 rmse / against,
-                len(flown) - len(kept),
+                len(flown) - len(completed),
             )
             print(
                 f"{task + ', ' + name:38}{cart:10.4f}{one:7.2f}"
-                f"{angle:12.5f}{other:7.2f}{lost:6}",
+                f"{angle:12.5f}{other:7.2f}{losses:6}",
                 flush=True,
             )
             row = {
@@ -156,7 +156,7 @@ def main() -> None:
             }
             results.append(
                 {key: v if isinstance(v, str) else float(v) for key, v in row.items()}
-                | {"lost": lost}
+                | {"lost": losses}
             )
     write_results("delayed_pole", results)
 

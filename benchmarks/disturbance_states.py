@@ -86,20 +86,20 @@ class FilteredControl:
             )
             last = None
         else:
-            moved = self.filter.predict(self._belief, previous.input)
-            self._belief = self.filter.update(moved, belief.mean).belief
+            predicted = self.filter.predict(self._belief, previous.input)
+            self._belief = self.filter.update(predicted, belief.mean).belief
             last = replace(self._last, input=previous.input)
         estimated = perf_counter()
         wide = Reference(
             np.hstack([reference.states, np.zeros_like(reference.states)]),
             reference.inputs,
         )
-        found = self._last = self.inner.control(self._belief, wide, last)
+        decision = self._last = self.inner.control(self._belief, wide, last)
         self.seconds.append((estimated - begin, perf_counter() - estimated))
         return replace(
-            found,
-            means=found.means[:, :STATES],
-            covariances=found.covariances[:, :STATES, :STATES],
+            decision,
+            means=decision.means[:, :STATES],
+            covariances=decision.covariances[:, :STATES, :STATES],
             disturbance=None,
         )
 

@@ -75,9 +75,10 @@ class Exact:
 
     def predict(self, state: torch.Tensor, input: torch.Tensor) -> Gaussian:
         """The next state, which is certain."""
-        moved = pendulum_many(state.numpy(), input.numpy())[0]
+        next_state = pendulum_many(state.numpy(), input.numpy())[0]
         return Gaussian(
-            torch.from_numpy(moved), torch.zeros(*state.shape, 2, dtype=torch.float64)
+            torch.from_numpy(next_state),
+            torch.zeros(*state.shape, 2, dtype=torch.float64),
         )
 
     def linearize(
@@ -126,8 +127,10 @@ def random_motion(steps: int, delay: int, seed: int = 0) -> tuple[Array, Array]:
     ]
     states = [np.zeros(2)]
     for k in range(steps):
-        moved = pendulum(states[-1], inputs[k - delay] if k >= delay else np.zeros(1))
-        states.append(moved + rng.normal(0, NOISE))
+        next_state = pendulum(
+            states[-1], inputs[k - delay] if k >= delay else np.zeros(1)
+        )
+        states.append(next_state + rng.normal(0, NOISE))
     return np.array(states), inputs
 
 
@@ -363,13 +366,13 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     states, inputs = random_motion(600, DELAY)
-    found = estimate_delay(states, inputs)
-    low, high = found.interval
+    delay = estimate_delay(states, inputs)
+    low, high = delay.interval
     print(
-        f"delay found in the random motion: {found.steps:.1f} steps, 95 % interval "
+        f"delay found in the random motion: {delay.steps:.1f} steps, 95 % interval "
         f"{low:.2f} to {high:.2f}"
     )
-    model = learned(states, inputs, round(found.steps))
+    model = learned(states, inputs, round(delay.steps))
     columns = (
         f"{'RMSE':>9}  {'ratio':24}fell  {'NEES (95 % band)':22}{'ms':>8}{'filter':>8}"
     )

@@ -445,8 +445,8 @@ def compare(
         seed += 1
     lower, upper = case.controller.problem.inputs.first
     inputs = np.array(comparison.inputs)
-    moved = inputs.max(axis=0) - inputs.min(axis=0)
-    ranges = np.where(np.isfinite(upper - lower), upper - lower, moved)
+    used_ranges = inputs.max(axis=0) - inputs.min(axis=0)
+    ranges = np.where(np.isfinite(upper - lower), upper - lower, used_ranges)
     rows = []
     for precision, answers in comparison.answers.items():
         differences = np.array(answers.differences)

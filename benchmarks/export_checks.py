@@ -158,12 +158,12 @@ class CheckedController(CompiledController):
         self.replay = SanitizedReplay(controller, precision, kept_bytes)
 
     def _step(self, belief: Gaussian, reference: Any) -> np.ndarray:
-        kept = bytes(self._struct.fields)
+        fields_before = bytes(self._struct.fields)
         input = super()._step(belief, reference)
         dtype = self._library.dtype
         status = np.intc(self._struct.fields.status)
         self.replay.ask(
-            kept,
+            fields_before,
             to_array(belief.mean).astype(dtype).tobytes(),
             to_array(belief.covariance).astype(dtype).tobytes(),
             bytes(reference),

@@ -88,15 +88,22 @@ def main() -> None:
 def measured(packed: kernels.Packed, size: int, belief: str) -> dict:
     """One moment-matched Jacobian of six GPs over ``size`` points, beside its floor."""
     S = BELIEFS[belief] * (np.eye(STATES) + 0.1)
-    asked = packed, np.zeros((1, STATES)), S[None], np.zeros((1, INPUTS)), False, True
-    kernels.gp_moments(*asked)
+    arguments = (
+        packed,
+        np.zeros((1, STATES)),
+        S[None],
+        np.zeros((1, INPUTS)),
+        False,
+        True,
+    )
+    kernels.gp_moments(*arguments)
     times = []
     rates = []
     began = time.process_time()
     while time.process_time() - began < TIMES["seconds"] or len(times) < TIMES["least"]:
         rates.append(issue_rate())
         start = time.process_time()
-        kernels.gp_moments(*asked)
+        kernels.gp_moments(*arguments)
         times.append(time.process_time() - start)
     middle = float(np.median(times))
     general = instructions(packed, reduced=True) / max(rates)

@@ -53,21 +53,22 @@ def main() -> None:
     parser.add_argument("--torch-jacobian-up-to", type=int, default=500)
     arguments = parser.parse_args()
     torch.set_default_dtype(torch.float64)
-    here = machine()
+    computer = machine()
     results = []
     began = time.perf_counter()
     gps = posterior(8).packed
-    at = belief()
+    uncertain_state = belief()
     u = np.zeros(INPUTS)
-    mu = at.mean.numpy()[None]
-    S = at.covariance.numpy()[None]
+    mu = uncertain_state.mean.numpy()[None]
+    S = uncertain_state.covariance.numpy()[None]
     kernels.linearize_gps(gps, mu, u[None], False, np.zeros(STATES), False)
     kernels.expand_gps(gps, mu, u[None])
     kernels.gp_moments(gps, mu, S, u[None], derivatives=True)
     first = time.perf_counter() - began
     print(
-        f"{describe(here)}\nfirst calls of the three kernels: {first:.2f} s (compiled, "
-        "or read from the cache)\n"
+        f"{describe(computer)}\n"
+        f"first calls of the three kernels: {first:.2f} s (compiled, or read from the "
+        "cache)\n"
     )
     for size in arguments.sizes:
         gp = posterior(size)
@@ -78,14 +79,14 @@ def main() -> None:
         ):
             own = next(iter(group))
             times = time_interleaved(group, arguments.seconds)
-            found = {name: call() for name, call in group.items()}
-            for name, taken in times.items():
+            values = {name: call() for name, call in group.items()}
+            for name, samples in times.items():
                 row = (
                     {"N": size, "what": name}
-                    | taken.summary()
-                    | {"ratio": taken.over(times[own])}
+                    | samples.summary()
+                    | {"ratio": samples.over(times[own])}
                 )
-                rows.append(row | {"difference": difference(found[name], found[own])})
+                rows.append(row | {"difference": difference(values[name], values[own])})
         keys = ("what", "median", "p99", "ratio", "difference", "samples")
         header = (
             f"N = {size}",
@@ -102,7 +103,7 @@ def main() -> None:
         )
         results += rows
     write_results(
-        "gp", results, machine=here, first_calls=first, states=STATES, inputs=INPUTS
+        "gp", results, machine=computer, first_calls=first, states=STATES, inputs=INPUTS
     )
 
 
@@ -147,12 +148,12 @@ def linearisation_groups(
     """
     n = gp.state_dim
     packed = gp.packed
-    at = (
+    moments_input = (
         belief.mean.numpy()[None],
         belief.covariance.numpy()[None],
         control.numpy()[None],
     )
-    mu, _, u = at
+    mu, _, u = moments_input
     query = torch.cat([belief.mean, control])
 
     def by_torch(mean, covariance, control):
@@ -172,7 +173,7 @@ def linearisation_groups(
         ]
 
     def jacobian():
-        d = kernels.gp_moments(packed, *at, derivatives=True)
+        d = kernels.gp_moments(packed, *moments_input, derivatives=True)
         return [part[0] for part in (d.J, d.dM_dS, d.dM_du, d.dV_dmu, d.dV_dS, d.dV_du)]
 
     frozen = to_gpytorch(gp).requires_grad_(False)
@@ -203,19 +204,19 @@ def linearisation_groups(
     groups: list[Group] = [
         {
             "moments": lambda: [
-                part[0] for part in kernels.gp_moments(packed, *at)[:2]
+                part[0] for part in kernels.gp_moments(packed, *moments_input)[:2]
             ],
             "moments, torch": lambda: by_torch(belief.mean, belief.covariance, control),
         },
         {"moments with Jacobians": jacobian},
         {
-            "moments, diagonal": lambda: kernels.gp_moments(packed, *at, diagonal=True)[
-                :2
-            ]
+            "moments, diagonal": lambda: kernels.gp_moments(
+                packed, *moments_input, diagonal=True
+            )[:2]
         },
         {
             "diagonal with Jacobians": lambda: kernels.gp_moments(
-                packed, *at, diagonal=True, derivatives=True
+                packed, *moments_input, diagonal=True, derivatives=True
             )
         },
         {"linearised": lambda: kernels.expand_gps(packed, mu, u)},

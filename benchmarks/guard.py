@@ -197,11 +197,11 @@ def take_turns(name: str, here: Side, base: Side) -> list[tuple[float, float]]:
 def row(name: str, comparison: Comparison) -> str:
     """Formats a case: both times, their ratio with its interval, and a verdict."""
     lower, upper = comparison.interval
-    here = 1e3 * np.median(comparison.here)
-    base = 1e3 * np.median(comparison.base)
+    milliseconds_here = 1e3 * np.median(comparison.here)
+    milliseconds_base = 1e3 * np.median(comparison.base)
     verdict = "SLOWER" if comparison.slower else ""
     return (
-        f"{name:30}{here:9.4f} ms, was {base:9.4f} ms: "
+        f"{name:30}{milliseconds_here:9.4f} ms, was {milliseconds_base:9.4f} ms: "
         f"{comparison.ratio:.3f} [{lower:.3f}, {upper:.3f}] {verdict}"
     ).rstrip()
 

@@ -149,7 +149,7 @@ def parts(system: System, flown: GPMPC, state: Array) -> bool:
 
     A loop that is unstable there may settle elsewhere, or at the bounds of its inputs.
     """
-    wanted = Reference(np.array(system.goal))
+    goal = Reference(np.array(system.goal))
     weighed = np.diagonal(flown.problem.cost.Q) > 0
     states = [state, state + APART]
     plans: list[Any] = [None, None]
@@ -157,7 +157,7 @@ def parts(system: System, flown: GPMPC, state: Array) -> bool:
     for _ in range(STEPS):
         for i in range(2):
             belief = Gaussian.certain(states[i])
-            plans[i] = flown.control(belief, wanted, plans[i])
+            plans[i] = flown.control(belief, goal, plans[i])
             states[i] = step(system, states[i], plans[i].input)
             lower = plans[i].input - system.input_lower
             upper = system.input_upper - plans[i].input
@@ -178,18 +178,18 @@ def measured_horizon(
     system: System, model: DynamicsModel, cost: Tracking, longest: int
 ) -> int | None:
     """Bisects for the shortest horizon with which flights do not part."""
-    lost = 0
-    held = longest
+    too_short = 0
+    long_enough = longest
     state = np.array(system.goal)
     if parts(system, controller(system, model, cost, longest), state):
         return None
-    while held - lost > 1:
-        middle = (lost + held) // 2
+    while long_enough - too_short > 1:
+        middle = (too_short + long_enough) // 2
         if parts(system, controller(system, model, cost, middle), state):
-            lost = middle
+            too_short = middle
         else:
-            held = middle
-    return held
+            long_enough = middle
+    return long_enough
 
 
 def main() -> None:
@@ -206,13 +206,13 @@ def main() -> None:
             models[f"learned, seed {seed}"] = learned_model(system, samples, seed)
         for kind, model in models.items():
             judged = controller(system, model, cost, 10).stability(system.goal)
-            known = judged.shortest_horizon
-            longest = 2 * (known or 100)
+            predicted = judged.shortest_horizon
+            longest = 2 * (predicted or 100)
             measured = measured_horizon(system, model, cost, longest)
             results.append(
-                {"plant": name, "model": kind, "known": known, "measured": measured}
+                {"plant": name, "model": kind, "known": predicted, "measured": measured}
             )
-            print(f"{name}, {kind}: known before {known}, measured {measured}")
+            print(f"{name}, {kind}: known before {predicted}, measured {measured}")
     write_results("horizons", {"results": results})
 
 

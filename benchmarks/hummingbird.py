@@ -64,8 +64,8 @@ def commanded_speeds(s, velocity, p):
     b3 = force / math.sqrt((force * force).sum())
     b2 = np.cross(b3, np.array([1.0, 0.0, 0.0]))
     b2 /= math.sqrt((b2 * b2).sum())
-    wanted = np.stack((np.cross(b2, b3), b2, b3))  # in its rows
-    S = 0.5 * (wanted @ R - R.T @ wanted.T)
+    attitude = np.stack((np.cross(b2, b3), b2, b3))  # in its rows
+    S = 0.5 * (attitude @ R - R.T @ attitude.T)
     error = np.array([-S[1, 2], S[0, 2], -S[0, 1]])
     torque = p.inertia @ (-k_p * error - k_d * w) + np.cross(w, p.inertia @ w)
     squares = (
@@ -163,11 +163,11 @@ def compiled_hummingbird() -> tuple[Array, Callable[[Array, Array, Array, int], 
         s[6:10] /= np.linalg.norm(s[6:10])
         velocity = rng.normal(0, 1, 3)
         commands = rng.uniform(300, 900, 4)
-        wanted = theirs.get_cmd_motor_speeds(
+        their_speeds = theirs.get_cmd_motor_speeds(
             Multirotor._unpack_state(s), {"cmd_v": velocity}
         )
         pairs = (
-            (commanded_speeds(s, velocity, p), wanted),
+            (commanded_speeds(s, velocity, p), their_speeds),
             (derivative(s, commands, p), theirs._s_dot_fn(0, s, commands)),
         )
         if any(

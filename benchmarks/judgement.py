@@ -63,8 +63,8 @@ class Reversed(Disturbance):
 @lru_cache(maxsize=8)
 def _reversed(plant: System, input: int) -> System:
     at_rest = plant.initial_input[input]
-    known = "successor" if hasattr(plant.dynamics, "successor") else "derivative"
-    of = getattr(plant.dynamics, known)
+    method_name = "successor" if hasattr(plant.dynamics, "successor") else "derivative"
+    of = getattr(plant.dynamics, method_name)
 
     def turned(x: Any, u: Any) -> list[Any]:
         inputs = [u[j] for j in range(len(plant.input_names))]
@@ -72,7 +72,7 @@ def _reversed(plant: System, input: int) -> System:
         return of(x, inputs)
 
     names = {"state_names": plant.state_names, "input_names": plant.input_names}
-    return replace(plant, dynamics=SimpleNamespace(**names, **{known: turned}))
+    return replace(plant, dynamics=SimpleNamespace(**names, **{method_name: turned}))
 
 
 class Frozen(Disturbance):
@@ -143,7 +143,7 @@ def tank(horizon: int, steps: int = 120, on_step: Any = None, **more: Any) -> An
 
     A step takes five seconds.
     """
-    rest = [12.6, 13.0, 4.8, 4.9]
+    start = [12.6, 13.0, 4.8, 4.9]
     goal = [13.6, 14.0, 4.8, 4.9]
     plant = System(
         QuadrupleTank(),
@@ -152,7 +152,7 @@ def tank(horizon: int, steps: int = 120, on_step: Any = None, **more: Any) -> An
         input_lower=[0.0, 0.0],
         input_upper=[10.0, 10.0],
         initial_input=[3.15, 3.15],
-        start=rest,
+        start=start,
         goal=goal,
     )
     model = KnownModel(CasadiFunction(successor_function(plant)), 4, 2)
@@ -171,7 +171,7 @@ def tank(horizon: int, steps: int = 120, on_step: Any = None, **more: Any) -> An
         plant,
         controller,
         np.array(goal),
-        np.array(rest),
+        np.array(start),
         steps,
         on_step=on_step,
         on_failure="previous_plan",
@@ -205,10 +205,10 @@ def experiment(scenario: Scenario) -> Experiment:
     """Returns the flight, with a model that all flights of these settings share."""
     chosen = _trained(scenario.overrides)
     if scenario.start is not None:
-        moved = replace(chosen.system, start=scenario.start)
+        system = replace(chosen.system, start=scenario.start)
         chosen = replace(
             chosen,
-            system=moved,
+            system=system,
             plant=chosen.plant and replace(chosen.plant, start=scenario.start),
         )
     if scenario.noise is not None or scenario.process is not None:
@@ -339,12 +339,12 @@ def _late_sensors(steps: int) -> Callable[[System, float], Any]:
 
 def _heavier(factor: float, *names: str) -> Callable[[System, float], Any]:
     def other(system: System, start: float) -> Replaced:
-        known = {name: getattr(system.dynamics, name) for name in names}
+        parameters = {name: getattr(system.dynamics, name) for name in names}
         changes = {
             name: tuple(factor * each for each in value)
             if isinstance(value, tuple | list)
             else factor * value
-            for name, value in known.items()
+            for name, value in parameters.items()
         }
         return _other(start, system, **changes)
 

@@ -127,8 +127,8 @@ def _rollout(
     A = []
     B = []
     for u in torch.from_numpy(np.array(inputs)):
-        moved, by_state, by_input = predict_with_jacobian(model, x, u)
-        x = moved.mean
+        belief, by_state, by_input = predict_with_jacobian(model, x, u)
+        x = belief.mean
         states.append(x.numpy())
         A.append(by_state.numpy())
         B.append(by_input.numpy())

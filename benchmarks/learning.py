@@ -267,17 +267,17 @@ def main() -> None:
                     }
                     key["seeds"] = arguments.seeds
                     key["code"] = fingerprint(own_source(__file__))
-                    found = next(
+                    row_of_case = next(
                         (row for row in rows if key.items() <= row.items()), None
                     )
-                    if found is None:
-                        found = key | measured(
+                    if row_of_case is None:
+                        row_of_case = key | measured(
                             flights(*(way, trajectory, change, noise, arguments.seeds)),
                             change,
                         )
-                        rows.append(found)
+                        rows.append(row_of_case)
                         write_results("learning", rows)
-                    cell[way] = found
+                    cell[way] = row_of_case
                 best = cell[WAYS[-1]]["rmse"]
                 text = "".join(
                     f"{one['rmse']:10.4f} x{one['rmse'] / best:7.3f} lost "

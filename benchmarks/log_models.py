@@ -104,8 +104,10 @@ def flight_cases(folder: Path, splits: int) -> Iterator[Case]:
     pairs = list(itertools.combinations(names, 2))
     for pair in pairs[:: max(len(pairs) // splits, 1)][:splits]:
         others = [name for name in names if name not in pair]
-        train, rest = log.split([run.name for run in log if run.name not in others])
-        held_out = rest.split([*pair])[1] if len(rest.runs) > 2 else rest
+        training_runs = [run.name for run in log if run.name not in others]
+        train, held_out = log.split(training_runs)
+        if len(held_out.runs) > 2:
+            _, held_out = held_out.split([*pair])
         yield Case(" + ".join(pair), train, held_out)
 
 

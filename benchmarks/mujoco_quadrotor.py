@@ -103,10 +103,10 @@ def fly(
     A rigid body with neither estimate nor dither is flown by NMPC, else by one program
     a step.
     """
-    known = isinstance(model, KnownModel)
+    is_rigid_body = isinstance(model, KnownModel)
     solved = gain == dither == 0.0
     settings = PredictionSettings(
-        covariance="none" if known else "zero_order", disturbance_gain=gain
+        covariance="none" if is_rigid_body else "zero_order", disturbance_gain=gain
     )
     controller = GPMPC(
         model,
@@ -157,17 +157,17 @@ def learn(seed: int) -> tuple[System, ResidualModel]:
     chosen = np.sort(rng.permutation(len(x))[:200])
     B = torch.eye(12, dtype=torch.float64)[:, MOVED]
     trainer = Trainer(predicts="difference", scaling=standardize, restarts=0)
-    seen = [1, 3, 5, 6, 7, 8, 9, 10, 11]
+    seen_states = [1, 3, 5, 6, 7, 8, 9, 10, 11]
     data = Transitions(x[chosen], u[chosen], after[chosen])
     return fitted, ResidualModel.train(
-        known(fitted).function, data, B, seen, trainer=trainer, seed=seed
+        known(fitted).function, data, B, seen_states, trainer=trainer, seed=seed
     )
 
 
 def flights(seed: int) -> list[dict]:
     """All flights of one seed, as plain data."""
     fitted, learned = learn(seed)
-    found = []
+    rows = []
     for name, changed in VEHICLES.items():
         for path in PATHS:
             for controller, model, gain in CONTROLLERS:
@@ -175,7 +175,7 @@ def flights(seed: int) -> list[dict]:
                 flown = fly(mujoco_quadrotor(**changed), model, along(path), seed, gain)
                 errors = (flown.states - flown.references)[:, 0:6:2]
                 milliseconds = 1e3 * flown.seconds
-                found.append(
+                rows.append(
                     {
                         "seed": seed,
                         "vehicle": name,
@@ -188,7 +188,7 @@ def flights(seed: int) -> list[dict]:
                         "mass": fitted.dynamics.mass,
                     }
                 )
-    return found
+    return rows
 
 
 def summary(rows: list[dict]) -> str:
@@ -221,11 +221,11 @@ def main() -> None:
     """Flies what is missing, and prints the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=20)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     RESULTS.mkdir(parents=True, exist_ok=True)
     store = TrialStore(RESULTS / "mujoco_quadrotor.jsonl")
     rows = []
-    for seed in range(given.seeds):
+    for seed in range(arguments.seeds):
         name = fingerprint([own_source(__file__), seed])
         if name not in store.records:
             with one_thread():

@@ -58,12 +58,12 @@ def successor(x: Array, u: Array) -> Array:
     """The state 0.1 s later; the last axes are x, vx, y, vy and the accelerations."""
     v = x[..., [1, 3]]
     a = u - 0.3 * v * np.linalg.norm(v, axis=-1, keepdims=True)
-    moved = x[..., [0, 2]] + STEP * v + STEP**2 / 2 * a
+    positions = x[..., [0, 2]] + STEP * v + STEP**2 / 2 * a
     return np.stack(
         [
-            moved[..., 0],
+            positions[..., 0],
             v[..., 0] + STEP * a[..., 0],
-            moved[..., 1],
+            positions[..., 1],
             v[..., 1] + STEP * a[..., 1],
         ],
         axis=-1,
@@ -101,14 +101,16 @@ def scene(seed: int) -> tuple[Array, Array]:
     """
     rng = np.random.default_rng(seed)
     while True:
-        found = rng.uniform([0.9, -0.6, 0.25], [3.1, 0.6, 0.5], (3, 3))
+        obstacles = rng.uniform([0.9, -0.6, 0.25], [3.1, 0.6, 0.5], (3, 3))
         velocity = rng.uniform(-0.3, 0.3, 2)
         gaps = [
-            np.linalg.norm(found[i, :2] - found[j, :2]) - found[i, 2] - found[j, 2]
+            np.linalg.norm(obstacles[i, :2] - obstacles[j, :2])
+            - obstacles[i, 2]
+            - obstacles[j, 2]
             for i, j in ((0, 1), (0, 2), (1, 2))
         ]
         if min(gaps) > 0.3:
-            return found, velocity
+            return obstacles, velocity
 
 
 def fly(model: GPPosterior, probability: float, seed: int) -> dict:

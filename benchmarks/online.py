@@ -71,29 +71,31 @@ def main() -> None:
                 gp, *new
             ),
         }
-        cold, warming, taken = ({name: [] for name in ways} for _ in range(3))
+        cold, warming, repeated = ({name: [] for name in ways} for _ in range(3))
         for repeat in range(arguments.repeats + 1):
             for name, way in ways.items():
                 for turn in (
                     cold,
                     warming,
                     warming,
-                    taken,
+                    repeated,
                 ):  # the last finds the memory as a loop that learns at every step does
                     start = time.process_time()
                     way()
                     seconds = time.process_time() - start
                     if repeat:  # the first compiles
                         turn[name].append(seconds)
-        ratios = np.array(taken["fresh"]) / taken["add_one"]
-        medians = {name: float(np.median(seconds)) for name, seconds in taken.items()}
+        ratios = np.array(repeated["fresh"]) / repeated["add_one"]
+        medians = {
+            name: float(np.median(seconds)) for name, seconds in repeated.items()
+        }
         after = float(np.median(np.array(cold["fresh"]) / cold["add_one"]))
-        found = {
+        ratios_of_size = {
             "ratio": float(np.median(ratios)),
             "least": ratios.min(),
             "ratio_after_other_work": after,
         }
-        results.append({"size": size, "seconds": medians} | found)
+        results.append({"size": size, "seconds": medians} | ratios_of_size)
         row = "".join(f"{1e3 * median:12.2f}" for median in medians.values())
         print(f"{size:12}{row}{np.median(ratios):12.1f}{after:12.1f}", flush=True)
     write_results("online", results)

@@ -274,9 +274,9 @@ def main() -> None:
     if not installed():
         raise SystemExit(MISSING)
     use_one_thread()
-    here = machine()
+    computer = machine()
     rows: list[dict[str, Any]] = []
-    sections = [f"{describe(here)}\n"]
+    sections = [f"{describe(computer)}\n"]
     print(sections[0])
     for horizon in arguments.horizons:
         for section in measure(horizon, arguments.starts, arguments.seconds):
@@ -284,7 +284,7 @@ def main() -> None:
             title = f"H = {horizon}, {section[0]['kind']}, {section[0]['start']}"
             sections.append(f"{title}\n\n{peers.table(section)}\n")
             print(sections[-1], flush=True)
-    write_results("peer_acados", rows, machine=here)
+    write_results("peer_acados", rows, machine=computer)
     (RESULTS / "peer_acados.md").write_text("\n".join(sections))
 
 

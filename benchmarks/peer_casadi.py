@@ -146,7 +146,7 @@ class Casadi:
                 "lam_g0": _shifted(last.dynamics_multipliers).ravel(),
             }
         with interrupts_after():
-            found = self._solver(
+            solution = self._solver(
                 x0=start.ravel(),
                 p=np.concatenate(
                     [instance.state, instance.last, instance.targets.ravel()]
@@ -158,7 +158,7 @@ class Casadi:
                 **multipliers,
             )
         unknowns, of_bounds, of_dynamics = (
-            np.array(found[key]).reshape(H, -1) for key in ("x", "lam_x", "lam_g")
+            np.array(solution[key]).reshape(H, -1) for key in ("x", "lam_x", "lam_g")
         )
         return Solution(unknowns[:, :m].copy(), unknowns, of_bounds, of_dynamics)
 
@@ -227,13 +227,13 @@ def _options(plugin: str, H: int, n: int, m: int, tolerance: float) -> dict[str,
             **stages,
             "hpipm": {"iter_max": 100},
         }
-        found = {
+        subproblem = {
             "qpsol": "hpipm",
             "qpsol_options": hpipm,
             "tol_du": tolerance,
             "tol_pr": tolerance,
         }
-        return options | quiet | found | {"max_iter": MAX_ITERATIONS}
+        return options | quiet | subproblem | {"max_iter": MAX_ITERATIONS}
     fatrop = {"print_level": 0, "tol": tolerance, "mu_init": IPOPT_WARM["mu_init"]}
     structure = {
         "structure_detection": "manual",

@@ -61,10 +61,10 @@ class Daqp:
         else:
             rows = {"A": G} if len(G) else {}  # which it does not take empty here
             model.update(H=P, f=q, bupper=upper, blower=lower, **rows)
-        x, _, flag, found = model.solve()
+        x, _, flag, details = model.solve()
         status = STATUSES.get(int(flag), Status.NUMERICAL_TROUBLE)
         if not status.solved:
             del self._models[G.shape]  # the next one starts afresh
         return make_solution(
-            problem, status, x, found["lam"], iterations=int(found["iterations"])
+            problem, status, x, details["lam"], iterations=int(details["iterations"])
         )

@@ -69,7 +69,7 @@ class GPyTorchSlsqp:
 
         options = {"maxiter": 200, "ftol": self._tolerance}
         with exact_inference(), gpytorch.settings.skip_posterior_variances():
-            found = minimize(
+            result = minimize(
                 cost,
                 start.ravel(),
                 jac=True,
@@ -77,7 +77,7 @@ class GPyTorchSlsqp:
                 bounds=self._bounds,
                 options=options,
             )
-        return Plan(found.x.reshape(start.shape))
+        return Plan(result.x.reshape(start.shape))
 
     def _cost(
         self,
@@ -89,8 +89,8 @@ class GPyTorchSlsqp:
         increments = torch.diff(inputs, dim=0, prepend=last[None])
         total = (increments @ self._R * increments).sum()
         for k, target in enumerate(targets):
-            moved = self._model(torch.cat([x, inputs[k]])[None]).mean[:, 0]
-            x = x + moved if self._adds_state else moved
+            prediction = self._model(torch.cat([x, inputs[k]])[None]).mean[:, 0]
+            x = x + prediction if self._adds_state else prediction
             total = total + (x - target) @ (
                 self._terminal if k + 1 == len(targets) else self._Q
             ) @ (x - target)

@@ -90,12 +90,12 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     use_one_thread()
-    here = machine()
+    computer = machine()
     rows = []
     sections = []
     gp = trained(TRAJECTORY)
     task = peers_problem()
-    print(f"{describe(here)}\n")
+    print(f"{describe(computer)}\n")
     for horizon in (*arguments.horizons, *arguments.alone):
         instances = record_instances(gp, task, horizon, STEPS)
         tables = {
@@ -108,18 +108,19 @@ def main() -> None:
             tables["converged by torch", "warm"] = slow(gp, task, horizon)
         tables["one program", "warm"] = one_program(gp, task, horizon)
         for (kind, start), cases in tables.items():
-            found = measure(
+            measured_rows = measure(
                 cases, gp, task, instances, arguments.seconds, cold=start == "cold"
             )
             sections.append(
-                f"H = {horizon}, {kind}, started {start}\n\n{table(found)}\n"
+                f"H = {horizon}, {kind}, started {start}\n\n{table(measured_rows)}\n"
             )
             print(sections[-1], flush=True)
             rows += [
-                {"kind": kind, "start": start, "H": horizon} | row for row in found
+                {"kind": kind, "start": start, "H": horizon} | row
+                for row in measured_rows
             ]
-    write_results("peers", rows, machine=here)
-    (RESULTS / "peers.md").write_text("\n".join([f"{describe(here)}\n", *sections]))
+    write_results("peers", rows, machine=computer)
+    (RESULTS / "peers.md").write_text("\n".join([f"{describe(computer)}\n", *sections]))
 
 
 def peers_problem() -> Problem:
@@ -294,9 +295,9 @@ def measure(
         for name, make in cases.items()
         if make is not None
     }
-    taken = time_interleaved(runs, seconds, min_rounds=MIN_ROUNDS, in_a_row=IN_A_ROW)
+    samples = time_interleaved(runs, seconds, min_rounds=MIN_ROUNDS, in_a_row=IN_A_ROW)
     first, later = (
-        {name: times.split(IN_A_ROW)[part] for name, times in taken.items()}
+        {name: times.split(IN_A_ROW)[part] for name, times in samples.items()}
         for part in (0, 1)
     )
     rows = []
@@ -342,15 +343,15 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
         "samples": "calls",
         "note": "note",
     }
-    used = [key for key in columns if any(key in row for row in rows)]
+    shown = [key for key in columns if any(key in row for row in rows)]
     cells = [
         [
             f"{row[key]:.0%}" if key == "within" and key in row else row.get(key)
-            for key in used
+            for key in shown
         ]
         for row in rows
     ]
-    return markdown_table([columns[key] for key in used], cells)
+    return markdown_table([columns[key] for key in shown], cells)
 
 
 if __name__ == "__main__":

@@ -154,7 +154,7 @@ def run_pass(
     for i, problem in enumerate(problems):
         for name in ("P", "q", "G", "lower", "upper"):
             np.copyto(getattr(buffer, name), getattr(problem, name))
-        given = (
+        program = (
             QuadraticProgram.from_stacked(*vars(buffer).values())
             if as_program
             else buffer
@@ -162,13 +162,16 @@ def run_pass(
         if flush:
             CACHES[:] = i
         began = perf_counter()
-        answer = solve(given)
+        answer = solve(program)
         seconds[i] = perf_counter() - began
-        x, rest = answer  # copied, so that no solver's memory grows with the sequence
+        x, details = (
+            answer  # copied, so that no solver's memory grows with the sequence
+        )
+        duals = details["lam"] if isinstance(details, dict) else details.multipliers
         answers.append(
             (
                 x.copy(),
-                np.array(rest["lam"] if isinstance(rest, dict) else rest.multipliers),
+                np.array(duals),
             )
         )
     gc.enable()
@@ -228,8 +231,8 @@ def measure_cell(horizon: int, mode: str, settings: argparse.Namespace) -> dict:
         seconds = {name: np.full(len(some), np.inf) for name in fast}
         for _ in range(passes):
             for name, begin in fast.items():
-                taken, answers = run_pass(begin, some, flush, False)
-                seconds[name] = np.minimum(seconds[name], taken)
+                times, answers = run_pass(begin, some, flush, False)
+                seconds[name] = np.minimum(seconds[name], times)
                 if not flush:
                     cell["solvers"].setdefault(name, {})["residual"] = max(
                         map(worst_residual, some, answers)
@@ -239,10 +242,10 @@ def measure_cell(horizon: int, mode: str, settings: argparse.Namespace) -> dict:
     for name, begin in slow.items():
         if settings.slow_solvers:
             some = problems[: settings.slow_solvers]
-            taken, answers = run_pass(begin, some, False, True)
+            times, answers = run_pass(begin, some, False, True)
             cell["solvers"][name] = {
                 "residual": max(map(worst_residual, some, answers)),
-                "hot": quantiles(taken[1:]),
+                "hot": quantiles(times[1:]),
             }
     best = min(
         (DAQP_WARM, DAQP_COLD), key=lambda name: cell["solvers"][name]["hot"]["median"]

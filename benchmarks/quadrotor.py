@@ -78,7 +78,7 @@ def recorded(
 
     ``std`` is what the controller is told to be unsure of.
     """
-    asked: list[Asked] = []
+    requests: list[Asked] = []
 
     class Recording:
         horizon = controller.horizon
@@ -90,7 +90,7 @@ def recorded(
                 torch.as_tensor(belief.mean, dtype=torch.float64), std**2 * eye
             )
             decision = controller.control(belief, reference, previous)
-            asked.append(Asked(belief, reference, previous, decision))
+            requests.append(Asked(belief, reference, previous, decision))
             return decision
 
     references = states_along(
@@ -106,4 +106,4 @@ def recorded(
         seed=seed,
         on_failure="previous_plan",
     )
-    return asked
+    return requests

@@ -400,14 +400,18 @@ def play_robustness(entry: Path, robot: str, kind: str, size: int) -> str:
     )
     who = Watchful(_real_time_pilot(model, robot), RollOut(fine), JOINTS[robot])
     store = beside(entry, f"_robustness_{size}_{code_fingerprint()[:8]}.json")
-    found = robustness(league_controller(AbstractController, who), robot, size, store)
-    shares = {part: float(np.mean(successes)) for part, successes in found.items()}
+    successes_by_part = robustness(
+        league_controller(AbstractController, who), robot, size, store
+    )
+    shares = {
+        part: float(np.mean(successes)) for part, successes in successes_by_part.items()
+    }
     lines = [
         f"| {robot}, robustness 2, {kind} model | flights | up after 10 s |",
         "|---|---|---|",
     ]
     lines += [
-        f"| {part} | {len(found[part])} | {share:.3f} |"
+        f"| {part} | {len(successes_by_part[part])} | {share:.3f} |"
         for part, share in shares.items()
     ]
     return "\n".join([*lines, f"| mean | | {np.mean(list(shares.values())):.3f} |"])
@@ -425,9 +429,9 @@ def play_film(entry: Path, robot: str, kind: str) -> Path:
 
 def play_script(entry: Path, robot: str) -> float:
     """Returns the score by the league's script, which draws without a seed."""
-    found = find_spec("double_pendulum")
+    package = find_spec("double_pendulum")
     where = (
-        Path(str(found and found.origin)).resolve().parents[3]
+        Path(str(package and package.origin)).resolve().parents[3]
         / "leaderboard"
         / robot
         / "simulation_v3"
@@ -446,9 +450,9 @@ def play_script(entry: Path, robot: str) -> float:
     (results / "sim_swingup.csv").unlink(
         missing_ok=True
     )  # the script would score it again
-    given = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
+    search_paths = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
     paths = [
-        str(Path(path).resolve()) for path in (entry.parent, *given)
+        str(Path(path).resolve()) for path in (entry.parent, *search_paths)
     ]  # the script runs in its own folder
     command = [sys.executable, "calculate_leaderboard_score.py", entry.name]
     subprocess.run(
@@ -627,19 +631,19 @@ def league_parameters(limits: list[float]) -> Any:
     from double_pendulum.model.model_parameters import model_parameters
 
     d = double_pendulum().dynamics
-    found = model_parameters()
-    found.set_mass(list(d.masses))
-    found.set_length(list(LENGTHS))
-    found.set_com(list(d.centres))
-    found.set_inertia(
+    parameters = model_parameters()
+    parameters.set_mass(list(d.masses))
+    parameters.set_length(list(LENGTHS))
+    parameters.set_com(list(d.centres))
+    parameters.set_inertia(
         [i + m * r * r for i, m, r in zip(d.inertias, d.masses, d.centres, strict=True)]
     )
-    found.set_gravity(9.81)
-    found.set_motor_inertia(0.0)
-    found.set_damping([0.0, 0.0])
-    found.set_cfric([0.0, 0.0])
-    found.set_torque_limit(limits)
-    return found
+    parameters.set_gravity(9.81)
+    parameters.set_motor_inertia(0.0)
+    parameters.set_damping([0.0, 0.0])
+    parameters.set_cfric([0.0, 0.0])
+    parameters.set_torque_limit(limits)
+    return parameters
 
 
 def torque_limits(robot: str) -> list[float]:
@@ -657,9 +661,9 @@ def right_hand_side() -> Callable[[float, Array, Array], Array]:
         state = [x[0] - np.pi, float(x[2]), float(x[1]), float(x[3])]
         first = shoulder.derivative(state, [float(tau[0])])
         second = elbow.derivative(state, [0.0])
-        moved = elbow.derivative(state, [float(tau[1])])
+        driven = elbow.derivative(state, [float(tau[1])])
         return np.array(
-            [x[2], x[3], *(first[i] + moved[i] - second[i] for i in (1, 3))]
+            [x[2], x[3], *(first[i] + driven[i] - second[i] for i in (1, 3))]
         )
 
     return derivative
@@ -735,14 +739,14 @@ def learn(
     )
     x = data.states
     u = data.inputs
-    seen = (
+    learned_data = (
         torch.cat(Features(range(4), [0], (0, 2), 4, 1)(x, u), dim=1),
         data.next_states - nominal(x, u),
     )
     one = torch.ones(1, dtype=torch.float64)
     noise = torch.full((1,), 1e-8, dtype=torch.float64)
-    rows = informative_points(seen[0], (scales[None], one, noise), points)
-    features, targets = (part[rows] for part in seen)
+    rows = informative_points(learned_data[0], (scales[None], one, noise), points)
+    features, targets = (part[rows] for part in learned_data)
     posterior = trainer.fit(
         features, targets, 1, start=None if before is None else before.residual
     ).posterior
@@ -840,17 +844,21 @@ def board(
 
 def _version() -> str:
     """Returns the commit of the checkout, or the version of the package."""
-    made = provenance()
-    return made["versions"]["gpmpc"] if made["git"] is None else made["git"]["commit"]
+    origin = provenance()
+    return (
+        origin["versions"]["gpmpc"]
+        if origin["git"] is None
+        else origin["git"]["commit"]
+    )
 
 
 def _play(model: Any, robot: str, draw: int) -> dict[str, Any]:
     who = pilot(model, robot)
-    found = play(who, robot, draw)
+    flight = play(who, robot, draw)
     ms = 1e3 * np.array(who.seconds)
     search = np.array(who.searched)
     return {
-        "score": found.score,
+        "score": flight.score,
         "searches": int(search.sum()),
         "search": float(np.median(ms[search])),
         "median": float(np.median(ms[~search])),
@@ -860,11 +868,11 @@ def _play(model: Any, robot: str, draw: int) -> dict[str, Any]:
 
 def _play_in_real_time(model: Any, robot: str, draw: int) -> dict[str, Any]:
     who = _real_time_pilot(model, robot)
-    found = play(who, robot, draw)
+    flight = play(who, robot, draw)
     ms = 1e3 * np.array(who.seconds)
     between = 1e3 * np.array(who.between)
     return {
-        "score": found.score,
+        "score": flight.score,
         "searches": len(who.searched),
         "search": 1e3 * float(np.median(who.searched)),
         "median": float(np.median(ms)),
@@ -925,8 +933,8 @@ def table(robot: str, rows: list[dict[str, Any]]) -> str:
 
 def main(arguments: list[str]) -> int:
     """Reads settings such as ``robot=acrobot``, plays, and prints the board."""
-    given = {"robot": "acrobot", "model": "true", "seeds": "0", "draws": "3"}
-    given |= {"board": "simulation", "time": "free", "folder": "outputs/realaigym"}
+    settings = {"robot": "acrobot", "model": "true", "seeds": "0", "draws": "3"}
+    settings |= {"board": "simulation", "time": "free", "folder": "outputs/realaigym"}
     choices = {"robot": tuple(ACTUATED), "model": tuple(DESCRIBED)}
     choices |= {
         "board": ("simulation", "script", "robustness", "film"),
@@ -935,52 +943,53 @@ def main(arguments: list[str]) -> int:
     try:
         for argument in arguments:
             key, _, value = argument.partition("=")
-            if key not in given:
-                raise SettingError(key, f"must be one of {', '.join(given)}")
-            given[key] = value
+            if key not in settings:
+                raise SettingError(key, f"must be one of {', '.join(settings)}")
+            settings[key] = value
         for key, names in choices.items():
-            if given[key] not in names:
+            if settings[key] not in names:
                 raise SettingError(
-                    key, f"must be one of {', '.join(names)}; got {given[key]!r}"
+                    key, f"must be one of {', '.join(names)}; got {settings[key]!r}"
                 )
         if not all(
-            number.isdigit() for number in (*given["seeds"].split(","), given["draws"])
+            number.isdigit()
+            for number in (*settings["seeds"].split(","), settings["draws"])
         ):
             raise SettingError(
                 "seeds, draws",
                 "must be numbers such as 0,1 and a number of draws such as 3",
             )
-        robot = given["robot"]
-        kind = given["model"]
-        folder = Path(given["folder"])
-        if given["board"] == "robustness" and kind == "gp":
+        robot = settings["robot"]
+        kind = settings["model"]
+        folder = Path(settings["folder"])
+        if settings["board"] == "robustness" and kind == "gp":
             raise SettingError(
                 "model",
                 "must be true or residual for board=robustness, which predicts over 2 "
                 "ms",
             )
-        if given["board"] in ("script", "film") and given["time"] == "real":
+        if settings["board"] in ("script", "film") and settings["time"] == "real":
             raise SettingError("time", "must be free for board=script and board=film")
         if find_spec("double_pendulum") is None:
             raise SettingError("simulator", INSTALL)
-        seeds = [int(seed) for seed in given["seeds"].split(",")]
-        draws = int(given["draws"])
-        if given["board"] == "simulation":
+        seeds = [int(seed) for seed in settings["seeds"].split(",")]
+        draws = int(settings["draws"])
+        if settings["board"] == "simulation":
             rows = board(
                 robot,
                 kind,
                 seeds,
                 [100 + i for i in range(draws)],
                 folder,
-                given["time"] == "real",
+                settings["time"] == "real",
             )
             _say(table(robot, rows))
             return 0
         for seed in seeds:
             entry = write_entry(robot, kind, seed, folder)
-            if given["board"] == "robustness":
+            if settings["board"] == "robustness":
                 _say(play_robustness(entry, robot, kind, draws))
-            elif given["board"] == "film":
+            elif settings["board"] == "film":
                 _say(f"  {play_film(entry, robot, kind)}")
             else:
                 for _ in range(draws):

@@ -223,11 +223,11 @@ def real_time_pilot(parts: Parts, joint: int) -> RealTimePilot:
     search = ManyStarts(
         parts.planner, parts.planner, parts.guesses, (2, 3), parts.criterion
     )
-    made = RealTimePilot(parts.controller, search, parts.criterion, joint)
+    real_time = RealTimePilot(parts.controller, search, parts.criterion, joint)
     for k in range(
-        (made.lead + 4) * TICKS
+        (real_time.lead + 4) * TICKS
     ):  # compiles everything before the clock counts
-        made.torques(np.array([np.pi, 0.2, 0.0, 0.0]), INPUT * k)
+        real_time.torques(np.array([np.pi, 0.2, 0.0, 0.0]), INPUT * k)
     return RealTimePilot(parts.controller, search, parts.criterion, joint)
 
 

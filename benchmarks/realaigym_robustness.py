@@ -84,7 +84,7 @@ def identify(states: list[Array], inputs: list[float]) -> tuple[int, float]:
 
     They explain best what inputs (T,) did to states (T, 4).
     """
-    found = []
+    candidates = []
     for response in np.linspace(0.1, 2.0, 20):
         acting = np.array(inputs)
         for k in range(1, len(acting)):
@@ -92,10 +92,10 @@ def identify(states: list[Array], inputs: list[float]) -> tuple[int, float]:
         estimate = estimate_delay(
             states, acting[:, None], LONGEST, resolution=1.0, resamples=1
         )
-        found.append(
+        candidates.append(
             (estimate.correlations.max(), round(estimate.steps), float(response))
         )
-    return max(found)[1:]
+    return max(candidates)[1:]
 
 
 @dataclass
@@ -150,12 +150,12 @@ class Watchful:
             state = self.ahead.open_loop(
                 state[None], np.array(self._acting[-self.delay :])[None, :, None]
             )[0, -1]
-        wanted = self.pilot.torques(
+        command = self.pilot.torques(
             [state[0] + np.pi, state[2], state[1], state[3]], t
         )[self.joint]
         last = self._acting[-1]
         torques[self.joint] = np.clip(
-            last + (wanted - last) / self.response, -TORQUE, TORQUE
+            last + (command - last) / self.response, -TORQUE, TORQUE
         )
         self._acting.append(
             float(
@@ -205,11 +205,11 @@ def robustness(
     repeated, pulses = (10, 50) if size >= 21 else (1, size)
 
     def model() -> list[bool]:
-        found = flights.check_modelpar_robustness(list(values), values)
-        return [success for name in values for success in found[name]["successes"]]
+        results = flights.check_modelpar_robustness(list(values), values)
+        return [success for name in values for success in results[name]["successes"]]
 
-    def most(found: dict[str, Any]) -> list[bool]:
-        return [np.mean(successes) > 0.5 for successes in found["successes"]]
+    def most(results: dict[str, Any]) -> list[bool]:
+        return [np.mean(successes) > 0.5 for successes in results["successes"]]
 
     noises = np.linspace(0.0, 0.5, size), np.linspace(0.0, 1.1, size)
     fly = {

@@ -159,12 +159,16 @@ def main() -> None:
         help="time between two steps of the plant [s]",
     )
     parser.add_argument("--turns", type=int, default=3)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     rows = []
-    for horizon in given.horizon:
+    for horizon in arguments.horizon:
         for record_problems in (True, False):
             row = measure(
-                horizon, given.seconds, given.apart, record_problems, given.turns
+                horizon,
+                arguments.seconds,
+                arguments.apart,
+                record_problems,
+                arguments.turns,
             )
             rows.append(row)
             print(

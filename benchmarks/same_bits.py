@@ -158,7 +158,7 @@ def main() -> int:
 def fly(names: list[str]) -> dict[str, np.ndarray]:
     """All arrays of the flights."""
     references = states_along(PATH, np.arange(STEPS + H + 1.0))
-    found = {}
+    arrays_by_name = {}
     for name in names:
         controller = CONTROLLERS[name]()
         if isinstance(controller, Cascade):
@@ -181,8 +181,10 @@ def fly(names: list[str]) -> dict[str, np.ndarray]:
             )
             keys = ("states", "inputs", "predicted_means", "predicted_covariances")
             arrays = {key: getattr(flight, key) for key in keys}
-        found |= {f"{name}.{key}": np.asarray(array) for key, array in arrays.items()}
-    return found
+        arrays_by_name |= {
+            f"{name}.{key}": np.asarray(array) for key, array in arrays.items()
+        }
+    return arrays_by_name
 
 
 if __name__ == "__main__":

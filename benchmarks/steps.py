@@ -78,10 +78,10 @@ def main() -> None:
         "--seconds", type=float, default=0.5, help="processor time a cell [s]"
     )
     arguments = parser.parse_args()
-    here = machine()
+    computer = machine()
     rows = []
     sections = []
-    print(f"{describe(here)}\n")
+    print(f"{describe(computer)}\n")
     for n, cache in product(arguments.states, arguments.caches):
         found = [
             row
@@ -99,8 +99,8 @@ def main() -> None:
             f"ms\n\n{table(found)}\n"
         )
         print(sections[-1], flush=True)
-    write_results("steps", rows, machine=here)
-    (RESULTS / "steps.md").write_text("\n".join([f"{describe(here)}\n", *sections]))
+    write_results("steps", rows, machine=computer)
+    (RESULTS / "steps.md").write_text("\n".join([f"{describe(computer)}\n", *sections]))
     (RESULTS / "steps.png").write_bytes(png(speed_figure(rows)))
 
 
@@ -159,7 +159,7 @@ def record_steps(
 ) -> list[tuple[Gaussian, Reference]]:
     """Flies the pendulums and returns the beliefs and references of the steps."""
     n = gp.state_dim
-    found = []
+    recorded_steps = []
 
     class Recorder:
         horizon = controller.horizon
@@ -167,7 +167,7 @@ def record_steps(
 
         def control(self, belief, reference, previous=None):
             belief = Gaussian(belief.mean, STD**2 * torch.eye(n, dtype=torch.float64))
-            found.append((belief, reference))
+            recorded_steps.append((belief, reference))
             return controller.control(belief, reference, previous)
 
     references = pendulum_references(n, steps + controller.horizon + 1)
@@ -179,7 +179,7 @@ def record_steps(
         steps,
         on_failure="previous_plan",
     )
-    return found
+    return recorded_steps
 
 
 def measure_size(
@@ -191,8 +191,8 @@ def measure_size(
     """
     times = time_interleaved(predictions(gp), seconds, min_rounds=10, flushed=flushed)
     size = {"n": gp.state_dim, "N": len(gp)}
-    for name, taken in times.items():
-        yield size | {"H": None, "what": name} | taken.summary()
+    for name, samples in times.items():
+        yield size | {"H": None, "what": name} | samples.summary()
     for horizon in horizons:
         compared = controllers(gp, horizon)
         steps = record_steps(gp, compared["mean only"], RECORDED_STEPS)
@@ -200,13 +200,13 @@ def measure_size(
             name: WarmStarted(controller, steps)
             for name, controller in compared.items()
         }
-        for name, taken in time_interleaved(
+        for name, samples in time_interleaved(
             cases, seconds, min_rounds=10, flushed=flushed
         ).items():
             yield (
                 size
                 | {"H": horizon, "what": name}
-                | taken.summary()
+                | samples.summary()
                 | {"unsolved": cases[name].unsolved}
             )
 
@@ -247,14 +247,14 @@ def table(rows: Sequence[Mapping]) -> str:
         key=lambda case: case[1] is not None,
     )
     cases.sort(key=lambda case: case[0] if case[1] else "")
-    found = {
+    cells = {
         (row["what"], row["H"], row["N"]): f"{row['median']:.3g} ({row['p99']:.3g})"
         for row in rows
     }
     lines = [
         [
             what if H is None else f"{what}, H = {H}",
-            *(found.get((what, H, size), "") for size in sizes),
+            *(cells.get((what, H, size), "") for size in sizes),
         ]
         for what, H in cases
     ]
@@ -279,14 +279,14 @@ def speed_figure(rows: Sequence[Mapping]) -> Figure:
         2, len(dims), sharey=True, squeeze=False, figsize=(2.6 * len(dims) + 0.8, 5.6)
     )
     for column, n in enumerate(dims):
-        here = [row for row in rows if row["n"] == n]
+        rows_of_size = [row for row in rows if row["n"] == n]
         upper = (
-            [row for row in here if row["H"] == horizon],
+            [row for row in rows_of_size if row["H"] == horizon],
             "N",
             f"training points N (H = {horizon})",
         )
         lower = (
-            [row for row in here if row["N"] == size],
+            [row for row in rows_of_size if row["N"] == size],
             "H",
             f"horizon H (N = {size})",
         )
@@ -298,14 +298,19 @@ def speed_figure(rows: Sequence[Mapping]) -> Figure:
                     (row for row in panel if row["what"] == what),
                     key=lambda row: row[key],
                 )
-                at = [row[key] for row in line]
+                values = [row[key] for row in line]
                 median = [row["median"] for row in line]
                 colour, marker = LOOKS[what]
                 axis.plot(
-                    at, median, color=colour, marker=marker, markersize=3.5, label=what
+                    values,
+                    median,
+                    color=colour,
+                    marker=marker,
+                    markersize=3.5,
+                    label=what,
                 )
                 axis.fill_between(
-                    at,
+                    values,
                     median,
                     [row["p99"] for row in line],
                     color=colour,

@@ -107,12 +107,12 @@ class CircleData:
 
     def transitions(self, *_: Any) -> Transitions:
         """Returns them; the system that is asked for is this one."""
-        found = self.data.transitions(self.pendulum)
-        both = (found.states, found.next_states)
+        rows = self.data.transitions(self.pendulum)
+        both = (rows.states, rows.next_states)
         states, after = (
             torch.stack([x[:, 0].cos(), x[:, 0].sin(), x[:, 1]], dim=1) for x in both
         )
-        return Transitions(states, found.inputs, after)
+        return Transitions(states, rows.inputs, after)
 
 
 def fly(name: str, seed: int) -> dict[str, Any]:
@@ -186,12 +186,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("systems", nargs="*", default=SYSTEMS, help=", ".join(SYSTEMS))
     parser.add_argument("--seeds", type=int, default=20)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     FLIGHTS.parent.mkdir(parents=True, exist_ok=True)
     store = TrialStore(FLIGHTS)
     flights = []
-    for seed in range(given.seeds):
-        for system in given.systems:
+    for seed in range(arguments.seeds):
+        for system in arguments.systems:
             name = fingerprint([own_source(__file__), system, seed])
             if name not in store.records:
                 store.append(name, fly(system, seed))

@@ -280,13 +280,13 @@ def main() -> None:
     parser.add_argument("plants", nargs="*", default=list(PLANTS)[:4])
     parser.add_argument("--horizons", nargs="*", type=int, default=HORIZONS)
     parser.add_argument("--weightings", nargs="*", default=list(WEIGHTINGS))
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     FLIGHTS.parent.mkdir(parents=True, exist_ok=True)
     flights = []
     with FLIGHTS.open("a") as file:
-        for name in given.plants:
-            for weighting in given.weightings:
-                for horizon in given.horizons:
+        for name in arguments.plants:
+            for weighting in arguments.weightings:
+                for horizon in arguments.horizons:
                     for kind in ("plain", "many"):
                         flights.append(fly(name, horizon, weighting, kind))
                         file.write(json.dumps(flights[-1]) + "\n")

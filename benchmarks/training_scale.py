@@ -102,28 +102,28 @@ def cases(quick: bool) -> list[dict]:
     if not quick:
         sizes = (*sizes, 2000, 5000)
         many = (*many, 5000, 20000)
-    found = [{"what": "evaluation", "route": EXACT, "size": size} for size in sizes]
-    found += [
+    cases = [{"what": "evaluation", "route": EXACT, "size": size} for size in sizes]
+    cases += [
         {"what": "evaluation", "route": GPYTORCH, "size": size}
         for size in sizes
         if size <= 2000
     ]
-    found += [
+    cases += [
         {"what": "evaluation", "route": SPARSE, "size": size, "inducing": M}
         for M in (200, 500)
         for size in many
     ]
-    found += [
+    cases += [
         {"what": "evaluation", "route": GPYTORCH_SPARSE, "size": size, "inducing": 200}
         for size in many
     ]
-    found += [{"what": "training", "route": EXACT, "size": size} for size in sizes]
-    found += [
+    cases += [{"what": "training", "route": EXACT, "size": size} for size in sizes]
+    cases += [
         {"what": "training", "route": SPARSE, "size": size, "inducing": 200}
         for size in many
     ]
     return [
-        *sorted(found, key=lambda case: case["size"]),
+        *sorted(cases, key=lambda case: case["size"]),
         {"what": "posterior", "route": EXACT, "size": sizes[-1]},
     ]
 
@@ -146,9 +146,9 @@ def measure(what: str, route: str, size: int, inducing: int = 0) -> dict:
     imported = peak_megabytes()  # what is loaded at first use is no matrix
     evaluate()
     count = repeats(evaluate)
-    found = {"megabytes": peak_megabytes() - imported}
+    summary = {"megabytes": peak_megabytes() - imported}
     if route in (EXACT, SPARSE):
-        return quantiles([seconds_of(evaluate) for _ in range(count)]) | found
+        return quantiles([seconds_of(evaluate) for _ in range(count)]) | summary
     ours = evaluation(EXACT if route == GPYTORCH else SPARSE, x, y, inducing)
     ours()
     turns = [(seconds_of(evaluate), seconds_of(ours)) for _ in range(count)]
@@ -156,7 +156,7 @@ def measure(what: str, route: str, size: int, inducing: int = 0) -> dict:
     return (
         quantiles([theirs for theirs, _ in turns])
         | {"ratio": ratio["median"], "ratio p99": ratio["p99"]}
-        | found
+        | summary
     )
 
 
@@ -292,7 +292,7 @@ def posterior(x, y, imported: float) -> dict:
     gp = GPPosterior.from_hyperparameters(
         x, y.expand(size, k), scales, one, 1e-3 * one, input_dim=3
     )
-    found = {
+    summary = {
         "median": time.process_time() - begin,
         "built megabytes": peak_megabytes() - imported,
     }
@@ -300,11 +300,11 @@ def posterior(x, y, imported: float) -> dict:
     for propagator in (Linearization(), MomentMatching()):
         name = type(propagator).__name__
         linearize(propagator, gp, belief, x[0, 6:])
-        found[name] = seconds_of(
+        summary[name] = seconds_of(
             lambda propagator=propagator: linearize(propagator, gp, belief, x[0, 6:])
         )
-        found[f"{name} megabytes"] = peak_megabytes() - imported
-    return found | {"megabytes": peak_megabytes() - imported}
+        summary[f"{name} megabytes"] = peak_megabytes() - imported
+    return summary | {"megabytes": peak_megabytes() - imported}
 
 
 def seconds_of(call) -> float:

@@ -83,8 +83,8 @@ def true_model(name: str, plant: System) -> KnownModel:
         function: Any = Simulated(plant)
     else:
         # A plan counts turns, which the sensor of the cart-pole does not show.
-        known = cart_pole() if name == "cart_pole" else plant
-        function = CasadiFunction(successor_function(known))
+        prior = cart_pole() if name == "cart_pole" else plant
+        function = CasadiFunction(successor_function(prior))
     return KnownModel(function, len(plant.state_names), len(plant.input_names))
 
 
