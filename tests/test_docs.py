@@ -13,9 +13,10 @@ from pydoc import locate
 import numpy as np
 import pytest
 import torch
+import yaml
 
 import gpmpc
-from gpmpc.cli._settings import setting_names, settings_folders
+from tests.cli.command import called
 from tests.pages import BLOCK, ROOT, read
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
@@ -173,9 +174,17 @@ def test_every_page_with_python_is_followed_by_a_test():
     assert {path.name for path in PAGES if "```python" in path.read_text()} <= followed
 
 
-def test_the_settings_that_pages_name_are_there():
-    with settings_folders():
-        settings_of_run = {*setting_names("run")}
+def dotted(node, prefix=""):
+    """The names of nested settings."""
+    for key, value in node.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, dict):
+            yield from dotted(value, f"{prefix}{key}.")
+
+
+def test_the_settings_that_pages_name_are_there(tmp_path):
+    composed = called("run", "--cfg", cwd=tmp_path).stdout
+    settings_of_run = {*dotted(yaml.safe_load(composed))}
     named = {
         (path.name, name)
         for path in PAGES

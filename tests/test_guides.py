@@ -1,15 +1,12 @@
 """The guides run as they stand: files are written, Python runs, commands succeed."""
 
 import shlex
-from argparse import Namespace
 
 import numpy as np
 import pandas
 import pytest
 
-from gpmpc.cli._new import new
-from gpmpc.exceptions import SettingError
-from tests.cli.command import forked
+from tests.cli.command import called, forked
 from tests.pages import BLOCK, read
 
 
@@ -131,8 +128,9 @@ def test_a_new_project_runs_at_once(tmp_path, monkeypatch):
     ],
 )
 def test_a_project_takes_no_name_that_means_something_else(name, message, tmp_path):
-    with pytest.raises(SettingError, match=rf"\ANAME: {message}"):
-        new(Namespace(name=name, to=tmp_path / "project"))
+    done = called("new", name, "--to", "project", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"gpmpc: NAME: {message}")
     assert not [*tmp_path.iterdir()]
 
 

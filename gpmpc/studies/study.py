@@ -39,7 +39,7 @@ from gpmpc.models import DynamicsModel, load_model, save_model
 from gpmpc.parallel import in_processes
 from gpmpc.studies._document import Document, Table
 
-__all__ = ["Study", "TrialSpec", "TrialStore", "run_study"]
+__all__ = ["Document", "Study", "Table", "TrialSpec", "TrialStore", "run_study"]
 
 
 class LostFlight(GpmpcError):

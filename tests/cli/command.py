@@ -1,11 +1,16 @@
-"""Runs the command as a user does, or in a copy of a process that has imported it."""
+"""Runs the command as a user does, or in a process that has imported it."""
 
+import io
+import logging
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 import tempfile
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from unittest import mock
 
 PATH = str(Path(sys.executable).with_name("gpmpc"))
 IMPORTED = [
@@ -24,6 +29,7 @@ IMPORTED += [
 ]
 IMPORTED += ["gpmpc.studies.report", "gpmpc.studies.flight", "gpmpc.plotting._recorded"]
 SECONDS = 300  # a command may take
+ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)  # what it listens to
 
 _copies = multiprocessing.get_context("forkserver")
 _copies.set_forkserver_preload(IMPORTED)
@@ -86,3 +92,38 @@ def start(*arguments, cwd):
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
+
+
+def called(*arguments, cwd, **environment):
+    """Runs the command in this process, which is then as it was.
+
+    For ``--json``, which redirects streams of the process, ask ``forked``.
+    """
+    from gpmpc.cli import main
+
+    streams = io.StringIO(), io.StringIO()
+    handlers = {number: signal.getsignal(number) for number in ENDS}
+    log = logging.getLogger("gpmpc")
+    before = log.handlers, log.propagate, log.level
+    here = Path.cwd()
+    with (
+        redirect_stdout(streams[0]),
+        redirect_stderr(streams[1]),
+        mock.patch.object(sys, "argv", [PATH, *arguments]),
+        mock.patch.object(sys, "path", [*sys.path]),
+        mock.patch.object(sys, "unraisablehook", sys.unraisablehook),
+        mock.patch.dict(os.environ, environment),
+    ):
+        os.chdir(cwd)
+        try:
+            main()
+            code = 0
+        except SystemExit as end:
+            code = end.code
+        finally:
+            os.chdir(here)
+            log.handlers, log.propagate, log.level = before
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+    written = [stream.getvalue() for stream in streams]
+    return subprocess.CompletedProcess(arguments, code, *written)

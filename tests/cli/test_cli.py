@@ -10,8 +10,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from gpmpc.cli import _study
-from gpmpc.studies._document import Document
-from gpmpc.studies.study import TrialSpec
+from gpmpc.studies.study import Document, TrialSpec
 from tests.cli.command import forked, gpmpc
 
 ROW = " ".join(str(i / 7) for i in range(15))

@@ -14,11 +14,8 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "recording"))
 import damage
 import runs
 
-from gpmpc.cli._commands import COMMANDS
-from gpmpc.cli._log import log
-from gpmpc.exceptions import GpmpcError
 from gpmpc.recording import layout, read_run
-from tests.cli.command import forked
+from tests.cli.command import called, forked
 
 
 def gpmpc_log(*arguments, cwd):
@@ -103,16 +100,14 @@ def test_recovering_a_recording_without_a_step_writes_no_file(folder, tmp_path):
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_a_recording_without_steps_is_an_error_of_every_command(
-    folder, tmp_path, monkeypatch
-):
+def test_a_recording_without_steps_is_an_error_of_every_command(folder, tmp_path):
     data = (folder / "run.mcap").read_bytes()
     (tmp_path / "early.mcap").write_bytes(data[: chunk_starts(data)[0]])
-    monkeypatch.chdir(tmp_path)
-    parser = COMMANDS["log"].parser("log")
     for command in ("recover", "export", "layout"):
-        with pytest.raises(GpmpcError, match=r"early\.mcap: holds no step"):
-            log(parser.parse_args([command, "early.mcap"]))
+        result = called("log", command, "early.mcap", cwd=tmp_path)
+        assert result.returncode == 2
+        assert result.stderr.startswith("gpmpc: early.mcap: holds no step")
+        assert result.stderr.count("\n") == 1
     result = gpmpc_log("info", "early.mcap", cwd=tmp_path)
     assert result.returncode == 2
     assert result.stderr == "gpmpc: early.mcap: holds no step\n"
@@ -217,19 +212,17 @@ def foreign(folder):
     }
 
 
-def test_what_is_no_recording_is_refused_by_its_name(folder, tmp_path, monkeypatch):
+def test_what_is_no_recording_is_refused_by_its_name(folder, tmp_path):
     (tmp_path / "run.mcap").write_bytes((folder / "run.mcap").read_bytes())
     reasons = foreign(tmp_path)
-    parser = COMMANDS["log"].parser("log")
     before = sorted(tmp_path.iterdir())
-    monkeypatch.chdir(tmp_path)
     for name, reason in reasons.items():
         for command in ("info", "recover", "export", "layout"):
-            with pytest.raises(GpmpcError) as caught:
-                log(parser.parse_args([command, name]))
-            assert str(caught.value).startswith(name)
-            assert reason in str(caught.value)
-            assert "\n" not in str(caught.value)
+            result = called("log", command, name, cwd=tmp_path)
+            assert result.returncode == 2
+            assert result.stderr.startswith(f"gpmpc: {name}")
+            assert reason in result.stderr
+            assert result.stderr.count("\n") == 1
         assert sorted(tmp_path.iterdir()) == before
     result = gpmpc_log("info", "other.mcap", cwd=tmp_path)
     assert result.returncode == 2

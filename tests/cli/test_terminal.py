@@ -2,6 +2,7 @@
 
 import fcntl
 import json
+import logging
 import os
 import pty
 import select
@@ -20,7 +21,7 @@ from gpmpc.cli import _main
 from gpmpc.cli._commands import COMMANDS
 from gpmpc.cli._completion import candidates
 from gpmpc.cli._run import _was_interrupted
-from gpmpc.cli._terminal import Output, OutputEnded
+from gpmpc.cli._terminal import Output, OutputEnded, logging_console
 from gpmpc.exceptions import GpmpcError
 from tests.cli.command import PATH, SECONDS, forked
 
@@ -567,3 +568,20 @@ def test_ctrl_c_in_a_terminal_reaches_no_worker_while_it_starts(tmp_path):
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert {"a", "b", "c"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_log_messages_show_once_and_a_searchs_steps_never(capsys):
+    log = logging.getLogger("gpmpc")
+    before = log.handlers, log.propagate, log.level
+    try:
+        logging_console()
+        for _ in range(2):
+            logging.getLogger("gpmpc.gp._scaling").info("constant columns are centred")
+        logging.getLogger("gpmpc.gp._search").info(
+            "training: output 1 of 6: evaluation 3"
+        )
+    finally:
+        log.handlers, log.propagate, log.level = before
+    shown = capsys.readouterr().out
+    assert shown.count("constant columns are centred") == 1
+    assert "evaluation" not in shown

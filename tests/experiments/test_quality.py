@@ -7,11 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gpmpc.cli._experiment import experiment_of
 from gpmpc.exceptions import SettingError
 from gpmpc.experiments.quality import (
     FAMILIES,
@@ -26,6 +24,7 @@ from gpmpc.mpc import GPMPC, Box, Problem, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.studies.study import TrialStore, run_study
 from gpmpc.trajectories import Elliptical
+from tests.systems.experiments import experiment
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 CHEAP = Family("trajectory", "controller=convex controller.prediction.covariance=none")
@@ -76,23 +75,18 @@ def test_the_cost_is_the_sum_of_what_every_step_pays(rng):
 
 
 def flight(family, **changes):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        words = [
-            *family.words.split(),
-            "model.restarts=0",
-            "data.samples=60",
-            f"noise.process={[0.01] * 6}",
-        ]
-        return replace(experiment_of(compose("run", words)), **changes)
+    words = [
+        *family.words.split(),
+        "model.restarts=0",
+        "data.samples=60",
+        f"noise.process={[0.01] * 6}",
+    ]
+    return replace(experiment(*words), **changes)
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=lambda family: family.words)
 def test_the_words_of_a_family_are_settings_of_a_run(family):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        assert (
-            experiment_of(compose("run", [*family.words.split(), "horizon=2"])).loop
-            == "plant"
-        )
+    assert experiment(*family.words.split(), "horizon=2").loop == "plant"
 
 
 def test_all_controllers_and_propagations_are_contenders():

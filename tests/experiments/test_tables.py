@@ -29,9 +29,9 @@ from gpmpc.experiments.tables import (
 )
 from gpmpc.gp import SoftLimits, Transitions, identity, train
 from gpmpc.studies import study
-from gpmpc.studies._document import number
 from gpmpc.studies.study import TrialStore, run_study
 from gpmpc.trajectories import Hover
+from tests.studies.made_up import shown_number
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 SUBSYSTEMS = ("translational", "rotational")
@@ -267,20 +267,6 @@ def test_the_printed_figures_are_complete():
     assert figures["lorenz", "rotational", 10]["test_mse"] == Decimal("0.0044")
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (1.234e-7, "1.23e-7"),
-        (0.01234, "0.0123"),
-        (1.4567, "1.46"),
-        (0.0, "0"),
-        (12345.0, "1.23e4"),
-    ],
-)
-def test_numbers_are_short(value, text):
-    assert number(value) == text
-
-
 def test_every_document_tells_the_same_numbers(finished):
     experiment, _, records = finished
     named = [
@@ -298,7 +284,7 @@ def test_every_document_tells_the_same_numbers(finished):
         printed = row.statistics["test_mse"]
         assert float(line["test_mse_paper"]) == float(printed.paper)
         assert line["test_mse_paper_is"] == printed.position
-        assert number(printed.range[1]) in written["tables.md"]
+        assert shown_number(printed.range[1]) in written["tables.md"]
         assert f"| {row.size} |" in written["tables.md"]
     assert "a note on the data" in written["tables.md"]
     assert written["tables.tex"].count("\\toprule") == 1

@@ -15,25 +15,20 @@ from gpytorch.kernels import (
     ScaleKernel,
 )
 from gpytorch.likelihoods import FixedNoiseGaussianLikelihood, GaussianLikelihood
-from gpytorch.means import ConstantMean, LinearMean, ZeroMean
+from gpytorch.means import ConstantMean, LinearMean
 from packaging.version import Version
 
-from gpmpc._dynamics import predict_with_jacobian
 from gpmpc.exceptions import SettingError, ShapeError, UnsupportedModel
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import (
-    Hyperparameters,
     KernelPosterior,
     Transitions,
     exact_inference,
     from_gpytorch,
 )
-from gpmpc.gp._sparse import collapsed_bound
 from gpmpc.gp.casadi_ import casadi_function
-from gpmpc.models import Affine, ResidualModel
-from gpmpc.models._roll_out import RollOut
+from gpmpc.models import Affine, ResidualModel, RollOut, linearize
 from gpmpc.mpc import beyond_data
-from gpmpc.mpc._slopes import slope_covariances
 from gpmpc.propagation import (
     Linearization,
     MeanEquivalence,
@@ -43,52 +38,19 @@ from gpmpc.propagation import (
     best_propagator,
     differentiate,
 )
-
-
-class Model(gpytorch.models.ExactGP):
-    def __init__(self, x, y, kernel, mean=None, likelihood=None, batch=()):
-        likelihood = likelihood or GaussianLikelihood(batch_shape=torch.Size(batch))
-        super().__init__(x, y, likelihood)
-        self.mean_module = mean or ZeroMean(batch_shape=torch.Size(batch))
-        self.covar_module = kernel
-
-    def forward(self, x):
-        return gpytorch.distributions.MultivariateNormal(
-            self.mean_module(x), self.covar_module(x)
-        )
-
-
-def data(size, outputs=2, d=3, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    x = 3 * torch.rand(size, d, generator=generator) - 1.5
-    y = torch.stack(
-        [torch.sin((a + 1) * x[:, 0]) + x[:, 1] * x[:, -1] + a for a in range(outputs)]
-    )
-    return x, y + 0.05 * torch.randn(outputs, size, generator=generator)
-
-
-def shaken(model, seed=0):
-    """Trained, as far as these tests care: parameters away from their defaults."""
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            if parameter.dim() < 2 or "inducing" not in str(parameter.shape):
-                parameter.add_(0.4 * torch.randn(parameter.shape, generator=generator))
-    return model.double().eval()
+from tests.gp.their_models import (
+    Model,
+    batch,
+    data,
+    matern_dynamics,
+    sgpr,
+    shaken,
+)
 
 
 def one_output(size, kernel, y=0, mean=None, **settings):
     x, targets = data(size)
     return shaken(Model(x, targets[y], kernel, mean, **settings), seed=y)
-
-
-def batch(size, kernel=None, outputs=2, mean=None):
-    x, y = data(size, outputs)
-    shape = torch.Size([outputs])
-    kernel = kernel or ScaleKernel(
-        RBFKernel(ard_num_dims=3, batch_shape=shape), batch_shape=shape
-    )
-    return shaken(Model(x.expand(outputs, -1, -1), y, kernel, mean, batch=shape))
 
 
 def theirs(model, query):
@@ -104,6 +66,12 @@ def theirs(model, query):
         for b in beliefs
     ]
     return tuple(torch.cat(parts).mT for parts in zip(*flat, strict=True))
+
+
+def jacobian_of(gp, query):
+    """Slopes of the mean by state and input."""
+    slopes = linearize(gp, query[:, :2].numpy(), query[:, 2:].numpy())
+    return torch.from_numpy(np.concatenate([slopes.A, slopes.B], axis=-1))
 
 
 def their_jacobian(model, query):
@@ -159,11 +127,11 @@ def test_a_frozen_model_is_exact_where_gpytorch_by_itself_is_not(size, freeze):
 def assert_equal(model, freeze):
     gp = freeze(model, input_dim=1, predicts="value")
     query = data(7, seed=5)[0]
-    belief, by_state, by_input = predict_with_jacobian(gp, query[:, :2], query[:, 2:])
+    belief = gp.predict(query[:, :2], query[:, 2:])
     mean, variance = theirs(model, query)
     assert torch.allclose(belief.mean, mean, rtol=0, atol=1e-10)
     assert torch.allclose(belief.variance, variance, rtol=0, atol=1e-10)
-    jacobian = torch.cat([by_state, by_input], dim=-1)
+    jacobian = jacobian_of(gp, query)
     assert torch.allclose(jacobian, their_jacobian(model, query), rtol=0, atol=1e-10)
 
 
@@ -184,10 +152,11 @@ def test_any_kernel_predicts_what_gpytorch_does(kind, size):
     model = one_output(size, ANY_KERNEL[kind](), mean=LinearMean(3))
     gp = KernelPosterior.from_gpytorch(model, input_dim=1, predicts="value")
     query = data(6, seed=5)[0]
-    belief, by_state, by_input = predict_with_jacobian(gp, query[:, :2], query[:, 2:])
+    belief = gp.predict(query[:, :2], query[:, 2:])
     mean, variance = theirs(model, query)
     assert torch.allclose(belief.mean, mean, rtol=0, atol=1e-10)
     assert torch.allclose(belief.variance, variance, rtol=0, atol=1e-10)
+    jacobian = jacobian_of(gp, query)
     step = 1e-5
     for d in range(3):
         shift = step * torch.eye(3)[d]
@@ -197,18 +166,8 @@ def test_any_kernel_predicts_what_gpytorch_does(kind, size):
             gp.predict(ahead[:, :2], ahead[:, 2:]).mean
             - gp.predict(behind[:, :2], behind[:, 2:]).mean
         )
-        jacobian = torch.cat([by_state, by_input], dim=-1)[..., d]
-        assert torch.allclose(jacobian, slope / (2 * step), rtol=1e-6, atol=1e-6)
-
-
-def matern_dynamics(predicts="next_state", size=40):
-    kernel = ScaleKernel(
-        MaternKernel(nu=2.5, ard_num_dims=3, batch_shape=torch.Size([2])),
-        batch_shape=torch.Size([2]),
-    )
-    return KernelPosterior.from_gpytorch(
-        batch(size, kernel), input_dim=1, predicts=predicts
-    )
+        expected = slope / (2 * step)
+        assert torch.allclose(jacobian[..., d], expected, rtol=1e-6, atol=1e-6)
 
 
 def test_predicting_leaves_gpytorchs_settings_to_the_process(monkeypatch):
@@ -235,8 +194,9 @@ def test_leading_batch_dimensions_are_those_of_the_query():
     single = gp.predict(x[1, 2], u[1, 2])
     assert torch.allclose(whole.mean[1, 2], single.mean, atol=1e-13)
     assert torch.allclose(whole.covariance[1, 2], single.covariance, atol=1e-13)
-    _, by_state, by_input = predict_with_jacobian(gp, x, u)
-    assert (by_state.shape, by_input.shape) == ((2, 3, 2, 2), (2, 3, 2, 1))
+    _, slopes = differentiate(MeanEquivalence(), gp, Gaussian.certain(x), u)
+    assert slopes.mean_by_mean.shape == (2, 3, 2, 2)
+    assert slopes.mean_by_input.shape == (2, 3, 2, 1)
 
 
 def test_a_difference_model_adds_the_state():
@@ -245,8 +205,9 @@ def test_a_difference_model_adds_the_state():
     plain = matern_dynamics()
     difference = matern_dynamics("difference")
     assert torch.allclose(difference.predict(x, u).mean, plain.predict(x, u).mean + x)
-    jacobians = [predict_with_jacobian(gp, x, u)[1] for gp in (plain, difference)]
-    assert torch.allclose(jacobians[1] - jacobians[0], torch.eye(2).expand(4, 2, 2))
+    expansions = [linearize(gp, x.numpy(), u.numpy()) for gp in (plain, difference)]
+    slopes, of_difference = (expansion.A for expansion in expansions)
+    np.testing.assert_allclose(of_difference - slopes, [np.eye(2)] * 4, rtol=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -298,7 +259,6 @@ def test_a_residual_of_any_kernel_is_rolled_out_as_one():
     RollOut(model)
     x = np.array([[0.2, -0.4]])
     u = np.array([[0.1]])
-    assert not slope_covariances(model, x[0], u[0]).any()
     assert beyond_data(model, [100.0, 0.0]) == []
     data = Transitions(x, u, x)
     with pytest.raises(UnsupportedModel, match="GPPosterior; got KernelPosterior"):
@@ -327,10 +287,10 @@ def test_a_frozen_model_knows_its_sizes_noise_type_and_moves():
         atol=1e-3,
     )
     assert gp.dtype == torch.float64
-    for batch in ((0,), (2, 0), (0, 3)):
-        belief = gp.predict(torch.zeros(*batch, 2), torch.zeros(*batch, 1))
-        assert belief.mean.shape == (*batch, 2)
-        assert belief.covariance.shape == (*batch, 2, 2)
+    for shape in ((0,), (2, 0), (0, 3)):
+        belief = gp.predict(torch.zeros(*shape, 2), torch.zeros(*shape, 1))
+        assert belief.mean.shape == (*shape, 2)
+        assert belief.covariance.shape == (*shape, 2, 2)
     with pytest.raises(
         ShapeError, match=r"an input \(\*batch, 1\); got \(5, 2\) and \(5, 2\)"
     ):
@@ -581,23 +541,6 @@ def test_a_model_that_has_predicted_is_frozen_as_before():
 # --- sparse --------------------------------------------------------------------------
 
 
-def sgpr(size=120, points=12, outputs=2):
-    x, y = data(size, outputs)
-    likelihood = GaussianLikelihood(batch_shape=torch.Size([outputs]))
-    shape = torch.Size([outputs])
-    kernel = ScaleKernel(
-        RBFKernel(ard_num_dims=3, batch_shape=shape), batch_shape=shape
-    )
-    inducing = InducingPointKernel(kernel, x[:points].clone(), likelihood)
-    return (
-        Model(
-            x.expand(outputs, -1, -1), y, inducing, likelihood=likelihood, batch=shape
-        )
-        .double()
-        .eval()
-    )
-
-
 @pytest.mark.parametrize(("corrected", "method"), [(False, "sgpr"), (True, "fitc")])
 def test_a_frozen_sparse_model_predicts_what_gpytorch_does(corrected, method):
     model = sgpr()
@@ -622,32 +565,6 @@ def test_a_frozen_sparse_model_predicts_what_gpytorch_does(corrected, method):
     assert not gp.has_observation_noise
     assert torch.allclose(belief.mean, mean, rtol=0, atol=1e-8)
     assert torch.allclose(belief.variance, variance, rtol=0, atol=1e-8)
-
-
-def test_the_bound_is_gpytorchs():
-    model = sgpr()
-    kernel, (x, *_), y = (
-        model.covar_module.base_kernel,
-        model.train_inputs,
-        model.train_targets,
-    )
-    ours = collapsed_bound(
-        model.covar_module.inducing_points.detach(),
-        x[0],
-        y.mT,
-        Hyperparameters(
-            kernel.base_kernel.lengthscale.detach()[:, 0],
-            kernel.outputscale.detach(),
-            model.likelihood.noise.detach()[:, 0],
-        ),
-        jitter=0.0,
-    )
-    likelihood = gpytorch.mlls.ExactMarginalLogLikelihood(
-        model.likelihood.train(), model.train()
-    )
-    with exact_inference(), torch.no_grad():
-        bound = likelihood(model(*model.train_inputs), y) * y.shape[-1]
-    assert torch.allclose(ours, bound, rtol=1e-8)
 
 
 def test_sparse_models_over_other_points_are_refused():

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from gpmpc.exceptions import SettingError
-from gpmpc.gp._kernel import factorize
+from gpmpc.gp import GPPosterior
 
 
 def arguments(size=150, outputs=3, d=4):
@@ -13,6 +13,14 @@ def arguments(size=150, outputs=3, d=4):
         1 + torch.rand(outputs),
         torch.full((outputs,), 1e-3),
     )
+
+
+def factorize(points, scales, signal, noise):
+    """The Cholesky factors of a posterior's kernel matrices."""
+    targets = torch.zeros(len(points), len(scales))
+    kernel = (scales, signal, noise)
+    gp = GPPosterior.from_hyperparameters(points, targets, *kernel, 0, "value")
+    return gp.cholesky
 
 
 def test_factors_made_in_place_are_the_same_bit_by_bit(monkeypatch):

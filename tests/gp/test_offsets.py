@@ -284,3 +284,20 @@ def test_what_flies_around_a_large_value_is_learned_by_default():
     gp = Trainer()(Transitions(x[:, :2] + far, x[:, 2:], y + far)).posterior
     error = gp.predict(held_out[:, :2] + far, held_out[:, 2:]).mean - far - expected
     assert float(error.square().mean().sqrt()) < 0.05
+
+
+def test_the_spread_of_a_constant_column_is_its_magnitude_or_one():
+    columns = np.column_stack(
+        [[1.0, 2.0, 3.0], [-4.0] * 3, [0.0] * 3, [0.5, 0.5 + 1e-12, 0.5]]
+    )
+    assert np.allclose(column_scales(columns), [1, 4, 1, 0.5])
+    assert np.allclose(column_scales(np.array([[2.0, 0.0]])), [2, 1])
+    assert np.allclose(
+        column_scales(np.array([[1e9, 1.0], [3e9, 1.002]])),
+        np.sqrt(2) * np.array([1e9, 1e-3]),
+    )
+    assert np.allclose(
+        column_scales(np.array([[1e9, 1.0, 1.0], [1e9 + 1e-2, 1.0, 1.0 + 1e-5]])),
+        [1e-2 / np.sqrt(2), 1, 1e-5 / np.sqrt(2)],
+        rtol=1e-5,
+    )

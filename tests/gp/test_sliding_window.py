@@ -11,7 +11,6 @@ from gpmpc.gp import (
     append_transitions,
     remove_points,
 )
-from gpmpc.gp._online import _divergence, _noise_variances, least_informative
 from tests.gp.small_models import residual_model
 
 
@@ -63,36 +62,57 @@ def divergence_over_functions(one, other, points):
     return total
 
 
-def information(gp):
-    return _divergence(
-        gp.precision.diagonal(dim1=-2, dim2=-1), gp.weights, _noise_variances(gp)
-    )
-
-
-def test_information_is_the_divergence_of_with_and_without():
-    gp = posterior(transitions(6))
-    expected = [
+def loses_least(gp, candidates):
+    """Which of the first points changes the functions least where it is dropped."""
+    losses = [
         divergence_over_functions(gp, remove_points(gp, i), gp.features)
-        for i in range(6)
+        for i in range(candidates)
     ]
-    assert information(gp).tolist() == pytest.approx(expected, rel=1e-5)
+    return losses.index(min(losses))
+
+
+def dropped(gp, new, points):
+    """Numbers of the points that the least informative rule drops for new ones."""
+    left = SlidingWindow(points, "least_informative")(gp, new).features
+    both = torch.cat([gp.features, new.features])
+    stays = (both[:, None] == left).all(-1).any(-1)
+    return torch.nonzero(~stays)[:, 0].tolist()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_point_whose_loss_changes_least_is_dropped(seed):
+    data = transitions(7, seed)
+    gp = posterior(data[:6], noise=[1e-4, 1e-2, 1.0][seed % 3])
+    grown = append_transitions(gp, data[6:])
+    assert dropped(gp, data[6:], 6) == [loses_least(grown, candidates=6)]
 
 
 def test_points_are_chosen_in_turn_as_if_each_was_dropped():
-    gp = posterior(transitions(25))
-    left = gp
+    data = transitions(26)
+    gp = posterior(data[:25])
+    left = append_transitions(gp, data[25:])
     names = list(range(25))
-    for chosen in least_informative(gp, 12):
-        position = int(information(left).argmin())
-        assert names.pop(position) == chosen
+    chosen = []
+    for _ in range(12):
+        position = loses_least(left, candidates=len(names))
+        chosen.append(names.pop(position))
         left = remove_points(left, position)
+    assert dropped(gp, data[25:], 14) == sorted(chosen)
 
 
 def test_of_two_equal_points_one_is_the_first_to_go():
-    data = transitions(20)
-    twice = append_transitions(posterior(data), data[7:8])
-    assert least_informative(twice, 1)[0] in (7, 20)
-    assert least_informative(twice, 1, candidates=20) == [7]
+    data = transitions(21)
+    copy = data[7:8]
+    gp = posterior(data[:20])
+    window = SlidingWindow(20, "least_informative")
+    # what just came stays
+    assert torch.equal(
+        window(gp, copy).features,
+        torch.cat([data.features[:7], data.features[8:20], copy.features]),
+    )
+    twice = append_transitions(gp, copy)
+    left = SlidingWindow(21, "least_informative")(twice, data[20:]).features
+    assert (left == copy.features).all(-1).sum() == 1
 
 
 @pytest.mark.parametrize("rule", ["oldest", "least_informative"])

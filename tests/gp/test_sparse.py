@@ -3,6 +3,7 @@ GP, and each other."""
 
 import logging
 
+import gpytorch
 import numpy as np
 import pytest
 import torch
@@ -23,6 +24,7 @@ from gpmpc.gp import (
     Trainer,
     Transitions,
     append_transitions,
+    exact_inference,
     informative_points,
     remove_points,
     standardize,
@@ -30,6 +32,7 @@ from gpmpc.gp import (
 from gpmpc.gp._kernel import kernel_matrix
 from gpmpc.gp._sparse import _cross, collapsed_bound, sparse_posterior
 from gpmpc.propagation import MomentMatching, MonteCarlo
+from tests.gp.their_models import sgpr
 
 
 def problem(rows=150, noise=1e-2, seed=0, spread=1.0):
@@ -178,6 +181,32 @@ def test_the_bound_reaches_the_evidence_with_every_point_only():
         evidence,
         atol=1e-5,
     )
+
+
+def test_the_bound_is_gpytorchs():
+    model = sgpr()
+    kernel, (x, *_), y = (
+        model.covar_module.base_kernel,
+        model.train_inputs,
+        model.train_targets,
+    )
+    ours = collapsed_bound(
+        model.covar_module.inducing_points.detach(),
+        x[0],
+        y.mT,
+        Hyperparameters(
+            kernel.base_kernel.lengthscale.detach()[:, 0],
+            kernel.outputscale.detach(),
+            model.likelihood.noise.detach()[:, 0],
+        ),
+        jitter=0.0,
+    )
+    likelihood = gpytorch.mlls.ExactMarginalLogLikelihood(
+        model.likelihood.train(), model.train()
+    )
+    with exact_inference(), torch.no_grad():
+        bound = likelihood(model(*model.train_inputs), y) * y.shape[-1]
+    assert torch.allclose(ours, bound, rtol=1e-8)
 
 
 def test_the_bounds_gradient_is_right():

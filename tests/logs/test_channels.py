@@ -14,13 +14,11 @@ from mcap_ros2.writer import Writer
 from pyulog import ULog
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))
-from gpmpc._bounds import MemoryBudget
 from gpmpc.exceptions import DataError
 from gpmpc.logs import inspect_log, read_log
-from gpmpc.logs._formats import read_file
-from gpmpc.logs._ros2 import ros2_decoder
 from tests.logs import strange
 from tests.logs.strange import BAG_MAPPING, STEP, TABLE_MAPPING
+from tests.logs.tables import read_file
 from tests.recording import runs
 
 ROWS = 400
@@ -126,10 +124,15 @@ def test_ros_2_numbers_are_those_of_the_reference_decoder(tmp_path):
 
 
 def test_both_byte_orders_are_read(tmp_path):
-    decode = ros2_decoder("my/A", "int16 a\nfloat64 b", MemoryBudget(Path(__file__)))
     little = b"\0\1\0\0" + struct.pack("<hxxxxxxd", -2, 0.5)
     big = b"\0\0\0\0" + struct.pack(">hxxxxxxd", -2, 0.5)
-    assert decode(little) == decode(big) == {"a": -2.0, "b": 0.5}
+    for name, data in (("little.mcap", little), ("big.mcap", big)):
+        path = strange.bag_of_one_chunk(
+            tmp_path / name, data, size=1000, definition="int16 a\nfloat64 b"
+        )
+        table = read_file(path).tables["/arm"]
+        assert (table["a"] == -2.0).all()
+        assert (table["b"] == 0.5).all()
 
 
 @pytest.mark.parametrize(

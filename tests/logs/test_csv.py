@@ -8,7 +8,7 @@ import pytest
 
 from gpmpc.exceptions import DataError
 from gpmpc.logs import LogMapping, read_log
-from gpmpc.logs._formats import read_file
+from tests.logs.tables import read_file
 
 MAPPING = {"time": "t", "states": {"x": ["x"]}, "inputs": {"u": ["u"]}}
 TABLE = pandas.DataFrame(

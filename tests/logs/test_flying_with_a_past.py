@@ -10,12 +10,7 @@ from gpmpc.calibration import Recording, calibrate
 from gpmpc.exceptions import SettingError
 from gpmpc.gaussian import Gaussian
 from gpmpc.logs import SavedModel
-from gpmpc.models import DelayedModel, KnownModel, LogDynamics, LogModel
-from gpmpc.models._kinematics import Increments
-from gpmpc.models._log_dynamics import OutputNoise
-from gpmpc.models._memory import Memory
-from gpmpc.models._parametric import AffineNominal
-from gpmpc.models._state_space import StateGroup, StateSpace
+from gpmpc.models import DelayedModel, KnownModel
 from gpmpc.mpc import (
     GPMPC,
     Box,
@@ -33,6 +28,7 @@ from gpmpc.mpc.baselines import LQR
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Dropout, ModelLoop, closed_loop, closed_loops
 from gpmpc.systems import System
+from tests.logs.made_models import affine_dynamics
 
 DT = 0.05
 LAG = 0.1  # time constant of the actuator [s]
@@ -73,22 +69,18 @@ PLANT = System(Cart(), DT)
 
 def dynamics(noise=0.0):
     """The cart as a model of a log knows it."""
-    groups = (StateGroup("x", ("x",)), StateGroup("v", ("v",)))
-    kinematics = Increments(StateSpace(groups))
     weights = np.zeros((2, 7))  # of (x, v, u), their differences from the last, and 1
     weights[1, 4] = FOLLOWED / DT
-    model = LogModel(
-        kinematics=kinematics,
-        nominal=AffineNominal(kinematics),
-        theta=np.array([[0, 1.0, 0, 0], [0, 0, 1.0, 0]]).ravel(),
-        history=(0, 0),
+    return affine_dynamics(
+        ("x", "v"),
+        theta=[[0, 1.0, 0, 0], [0, 0, 1.0, 0]],
+        time_step=DT,
+        noise=noise,
+        rows_back=1,
         lag=LATE,
         time_constants=np.array([LAG]),
-        memory=Memory(rows=1),
         weights=weights,
     )
-    variances = OutputNoise(np.zeros((4, 2)), np.full(2, noise))
-    return LogDynamics(model, 1, DT, variances)
 
 
 def controller(model, constraints=(), outputs=()):

@@ -12,10 +12,10 @@ import yaml
 
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.logs import LogMapping, inspect_log, read_log
-from gpmpc.logs._formats import read_file
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))
 from tests.cli.command import forked
+from tests.logs.tables import read_file
 
 ROWS = 240
 STEP = 0.25

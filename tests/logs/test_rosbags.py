@@ -8,7 +8,6 @@ import pytest
 
 from gpmpc.exceptions import DataError
 from gpmpc.logs import inspect_log, read_log
-from gpmpc.logs._formats import read_file
 
 pytest.importorskip("rosbags")
 from rosbags import rosbag1, rosbag2
@@ -233,20 +232,20 @@ def test_what_is_no_bag_is_refused_in_one_line(tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(DataError, match="empty: is a folder without a bag"):
-        read_file(empty)
+        read_log(empty, MAPPING)
     (tmp_path / "a.bag").write_bytes(b"no bag")
     (tmp_path / "a.db3").write_bytes(b"no database")
     for name in ("a.bag", "a.db3"):
         with pytest.raises(DataError, match=f"{name}: ") as refusal:
-            read_file(tmp_path / name)
+            read_log(tmp_path / name, MAPPING)
         assert "\n" not in str(refusal.value)
     folder = ros2(tmp_path / "messages", compression="MESSAGE")
     with pytest.raises(DataError, match="each message is compressed by itself"):
-        read_file(folder)
+        read_log(folder, MAPPING)
     whole = ros1(tmp_path / "whole.bag").read_bytes()
     (tmp_path / "cut.bag").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DataError, match="cut.bag: .*index looks damaged"):
-        read_file(tmp_path / "cut.bag")
+        read_log(tmp_path / "cut.bag", MAPPING)
 
 
 def test_a_chunk_of_ros_1_may_not_unfold_to_all_memory(tmp_path, monkeypatch):

@@ -21,12 +21,10 @@ from gpmpc.models import (
     load_model,
     save_model,
 )
-from gpmpc.models._past import has_past, states_along
-from gpmpc.mpc import beyond_data
+from gpmpc.mpc import GPMPC, Problem, Tracking, beyond_data
 from gpmpc.propagation import Linearization, MonteCarlo
 from gpmpc.signals import Signals
-from gpmpc.simulation import ModelLoop
-from gpmpc.simulation._simulator import ModelSimulator
+from gpmpc.simulation import ModelLoop, closed_loop
 from gpmpc.testing import check_model
 
 F = torch.float64
@@ -196,10 +194,16 @@ def test_measurements_of_a_delayed_model_have_its_names():
     (beyond,) = beyond_data(delayed, swapped)
     assert beyond.name == "rate"
     loop = ModelLoop(delayed, Linearization(), 0.1)
-    assert ModelSimulator(loop, swapped).mean.tolist() == [0.1, 9.0]
+    problem = Problem(Tracking([1.0, 1.0], [0.1]))
+    controller = GPMPC(delayed, Linearization(), problem, 2, [0.0])
+
+    def begun(initial):
+        return closed_loop(loop, controller, np.zeros((4, 2)), initial, 1)
+
+    assert begun(swapped).states[0].tolist() == [0.1, 9.0]
     named = Gaussian(torch.tensor([9.0, 0.1]), torch.diag(torch.tensor([4.0, 1.0])))
     belief = replace(named, names=("rate", "angle"))
-    assert ModelSimulator(loop, belief).covariance.diagonal().tolist() == [1.0, 4.0]
+    assert begun(belief).covariances[0].diagonal().tolist() == [1.0, 4.0]
 
 
 @pytest.mark.parametrize(("delay", "steps"), [(0.3 / 0.1, 3), ((0.1 + 0.2) / 0.1, 3)])
@@ -218,14 +222,20 @@ def test_a_noisy_model_has_the_past_of_its_model():
         draw(1, 9, 5), draw(2, 9, 1), scales, ones, 0.1 * ones, 1, "value"
     )
     noisy = NoisyModel(delayed, g, [1])
-    assert has_past(noisy)
-    assert not has_past(noisy.log_noise)
+    assert not hasattr(noisy.log_noise, "past")
     assert (noisy.measured_dim, noisy.past) == (2, delayed.past)
-    whole = [
-        states_along(model, np.ones((4, 2)), np.arange(3.0)[:, None])
-        for model in (noisy, delayed)
-    ]
-    np.testing.assert_array_equal(*whole)
+    states = 0.1 * draw(5, 9, 2)
+    inputs = draw(6, 8, 1)
+    judged = calibrate(noisy, Recording(states, inputs), horizon=2)
+    assert judged.names == ("angle", "rate")
+    measured = np.ones(2)
+    whole = []
+    for model in (noisy, delayed):
+        state = model.at_rest(measured, np.zeros(1))
+        for torque in range(3):
+            state = model.follow(state, np.array([float(torque)]), measured)
+            whole.append(state)
+    np.testing.assert_array_equal(whole[:3], whole[3:])
 
 
 def test_a_model_around_a_named_one_adds_no_names():

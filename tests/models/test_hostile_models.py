@@ -320,7 +320,7 @@ def test_a_long_tape_becomes_a_function_in_linear_time():
 
 def test_a_log_model_that_does_not_fit_together_is_refused(tmp_path):
     from gpmpc.logs import save_learned
-    from tests.models.hostile import of_a_quadrotor_log
+    from tests.logs.made_models import of_a_quadrotor_log
 
     path = tmp_path / "m.safetensors"
     save_learned(of_a_quadrotor_log(), path)
@@ -346,7 +346,7 @@ def test_a_log_model_that_does_not_fit_together_is_refused(tmp_path):
 
 def test_outputs_without_a_nominal_model_need_no_memory(tmp_path):
     from gpmpc.logs import save_learned
-    from tests.models.hostile import of_a_pendulum_log
+    from tests.logs.made_models import of_a_pendulum_log
 
     learned = of_a_pendulum_log()
     path = tmp_path / "m.safetensors"
@@ -363,7 +363,7 @@ def test_outputs_without_a_nominal_model_need_no_memory(tmp_path):
 @pytest.mark.parametrize("field", ["nominal", "kinematics"])
 def test_an_unknown_name_in_a_log_model_is_refused(tmp_path, field):
     from gpmpc.logs import save_learned
-    from tests.models.hostile import of_a_quadrotor_log
+    from tests.logs.made_models import of_a_quadrotor_log
 
     path = tmp_path / "m.safetensors"
     save_learned(of_a_quadrotor_log(), path)

@@ -10,8 +10,7 @@ from gpmpc.calibration import Recording, calibrate
 from gpmpc.datasets import RandomData
 from gpmpc.exceptions import SettingError, ShapeError
 from gpmpc.gp import GPPosterior, SparseTrainer, Trainer, Transitions, standardize
-from gpmpc.models import Affine, Features, ResidualModel, train
-from gpmpc.models._kinematic_rates import kinematic_residual
+from gpmpc.models import Affine, ResidualModel, train
 from gpmpc.propagation import Linearization
 from gpmpc.signals import Signals
 from gpmpc.systems import (
@@ -140,22 +139,27 @@ def test_noise_alone_is_not_learned():
         assert train(data, system=plant, **QUICK).posterior.residual.output_dim == 1
 
 
-def test_accelerations_move_velocities_and_these_positions():
-    class Jerk:
-        state_names = ("a", "v", "p")
-        input_names = ("u",)
+class Jerk:
+    state_names = ("a", "v", "p")
+    input_names = ("u",)
 
-        def derivative(self, x, u):
-            return [u[0], x[0], x[1]]
+    def derivative(self, x, u):
+        return [u[0], x[0], x[1]]
 
-    plant = System(
+
+def jerk_system(time_step):
+    return System(
         Jerk(),
-        time_step=0.1,
+        time_step,
         input_lower=[-1.0],
         input_upper=[1.0],
         rates={"a": "v", "v": "p"},
         region=[[-1.0] * 3, [1.0] * 3],
     )
+
+
+def test_accelerations_move_velocities_and_these_positions():
+    plant = jerk_system(0.1)
     model = train(rows(plant), system=plant, **QUICK).posterior
     assert model.residual.output_dim == 1
     fresh = rows(plant, noise=0.0, seed=1)
@@ -170,18 +174,13 @@ def test_noise_of_a_velocity_moves_its_position():
     next_a = a + h * u
     next_v = v + h * (a + next_a) / 2 + rng.normal(0, 0.1, 300)
     next_p = p + h * (v + next_v) / 2 + rng.normal(0, 0.001, 300)
-    kinematic = kinematic_residual(
-        rates={0: 1, 1: 2},
-        features=Features([0, 1, 2], [0], [], state_dim=3, input_dim=1),
-        nominal=None,
-        states=torch.from_numpy(states.T),
-        inputs=torch.from_numpy(u[:, None]),
-        next_states=torch.from_numpy(np.column_stack([next_a, next_v, next_p])),
-        time_step=h,
-    )
-    assert kinematic.B.shape == (3, 1)
+    after = np.column_stack([next_a, next_v, next_p])
+    data = Transitions(states.T, u[:, None], after)
+    model = train(data, system=jerk_system(h), **QUICK).posterior
+    assert model.B.shape == (3, 1)
     deviations = [0.1, h / 2 * 0.1]  # the second nearly all from the first
-    assert kinematic.noise[1:].sqrt().tolist() == pytest.approx(deviations, rel=0.1)
+    found = model.noise.diagonal()[1:].sqrt()
+    assert found.tolist() == pytest.approx(deviations, rel=0.1)
 
 
 def test_what_a_nominal_model_misses_is_learned():

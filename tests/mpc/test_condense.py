@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gpmpc.exceptions import ShapeError
-from gpmpc.mpc import Box, Problem, Tracking
+from gpmpc.mpc import Box, Problem, Tracking, dlqr
 from gpmpc.mpc._condense import condense, condense_with_feedback
 from gpmpc.mpc._cost import PENALIZED
 from gpmpc.mpc._linear_quadratic import (
@@ -19,6 +19,7 @@ from gpmpc.mpc._linear_quadratic import (
     evaluate_cost,
     expand,
 )
+from gpmpc.mpc._riccati import finite_horizon_lqr
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.status import Status
 from tests.mpc.double_pendulum import ACROBOT, PENDUBOT, UPRIGHT, DoublePendulum
@@ -514,3 +515,21 @@ def test_nor_do_nine_hundred_and_sixty_from_other_starts():
     in_feedback, solved = programs_of_the_double_pendulum(starts=10, seed=1)
     assert solved == 960
     assert in_feedback > 100
+
+
+def test_the_gain_of_a_long_horizon_is_stationary_and_exists(rng):
+    A = rng.normal(size=(1, 4, 4))
+    B = rng.normal(size=(1, 4, 2))
+    Q = np.eye(4)
+    R = np.eye(2)
+    gains, hessians = finite_horizon_lqr(A, B, Q[None], R[None], Q, 500)
+    varying, same = finite_horizon_lqr(
+        np.repeat(A, 500, axis=0), np.repeat(B, 500, axis=0), Q[None], R[None], Q, 500
+    )
+    assert np.allclose(gains[0], dlqr(A[0], B[0], Q, R), atol=1e-7)
+    assert np.allclose(gains, varying, atol=1e-7)
+    assert np.allclose(hessians, same, atol=1e-6)
+    unreachable, _ = finite_horizon_lqr(
+        2 * np.eye(4)[None], np.zeros((1, 4, 2)), Q[None], R[None], Q, 20
+    )
+    assert np.array_equal(unreachable, np.zeros((20, 2, 4)))

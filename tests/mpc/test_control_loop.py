@@ -6,18 +6,18 @@ import torch
 
 from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.gaussian import Gaussian
-from gpmpc.models import KnownModel
+from gpmpc.models import DelayedModel, KnownModel
 from gpmpc.mpc import (
     GPMPC,
     Box,
     ControlLoop,
+    FlightJudge,
     Inequality,
     PredictionSettings,
     Problem,
     Reference,
     Tracking,
 )
-from gpmpc.mpc._controller import model_of
 from gpmpc.mpc.baselines import LQR
 from gpmpc.propagation import Linearization
 from gpmpc.qp import CvxpySolver, PrimalActiveSet
@@ -283,10 +283,24 @@ def test_a_controller_that_estimates_more_states_is_judged():
 
 def test_a_controller_around_others_has_the_innermost_model():
     class Around:
+        horizon = 6
+        initial_input = np.zeros(1)
+
         def __init__(self, inner):
             self.controller = inner
 
-    inner = controller()
-    assert model_of(Around(Around(inner))) is inner.prediction.model
+        def control(self, *arguments):
+            return self.controller.control(*arguments)
+
+    problem = Problem(Tracking([1.0, 0.1], [0.1]))
+    delayed = DelayedModel(model(), 1)
+    inner = GPMPC(delayed, Linearization(), problem, 6, [0.0])
+    loops = [ControlLoop(inner), ControlLoop(Around(Around(inner)))]
+    x = np.zeros(2)
+    for _ in range(4):  # of a model whose state holds more than what is measured
+        applied, same = (loop.input(x, GOAL) for loop in loops)
+        assert applied.tolist() == same.tolist()
+        x = next_state(x, applied)
+    assert loops[1].failures == 0
     inner.model = np.eye(2)  # which is neither true nor false
-    assert model_of(Around(inner)) is inner.model
+    FlightJudge.of(Around(inner), state_dim=2, input_dim=1)

@@ -27,6 +27,7 @@ from gpmpc.qp import DualActiveSet
 from gpmpc.qp import _record as layout
 from gpmpc.status import Status
 from tests.mpc.small_models import LinearGaussian, double_integrator
+from tests.mpc.systems import linear_gaussian
 
 H = 12
 
@@ -459,3 +460,19 @@ def test_a_row_that_a_later_program_keeps_has_its_exact_price():
 )
 def test_a_bound_is_kept_again_where_it_is_missed_early(violations, is_kept):
     assert are_kept_again(np.array(violations)) is is_kept
+
+
+def test_an_input_beyond_its_bound_by_rounding_is_no_soft_bound():
+    hard = Box([-1.0, -1.0], [1.0, 1.0], penalty=None)
+    problem = Problem(
+        Tracking([1.0, 1.0], [0.1]), Box([-1e5], [1e5]), constraints=[hard]
+    )
+    model = linear_gaussian(2, 1)
+    prediction = GPMPC(model, Linearization(), problem, 4, [0.0]).prediction
+    request = read_request(
+        prediction, Gaussian.certain(np.zeros(2)), Reference(np.zeros(2)), None
+    )
+    local = prediction.linearize(initial_guess(prediction, request), request)
+    inputs = np.full((4, 1), 1e5 + 2e-5)
+    ending = local._replace(plan=local.plan._replace(inputs=inputs))
+    assert prediction.end_of_solved(ending, violation=2e-5) is Status.SOLVED

@@ -1,11 +1,14 @@
 """Stages cost what the problem says, flights end at a held goal, and relays pump."""
 
+from dataclasses import replace
+
 import casadi
 import numpy as np
 import pytest
 import torch
 
 from gpmpc._angles import wrap
+from gpmpc.gaussian import Gaussian
 from gpmpc.models import CasadiFunction, KnownModel
 from gpmpc.mpc import (
     GPMPC,
@@ -345,3 +348,26 @@ def test_feedback_of_a_flight_weighs_outputs_as_it_weighs_states():
         gains.append(foresight.with_gains(flight, asked).gains)
     assert np.abs(gains[0]).min() > 0.1
     assert np.allclose(gains[0], gains[1])
+
+
+@pytest.mark.parametrize("failed_steps", [0, 1, 3])
+def test_after_failed_steps_a_plan_is_compared_stage_by_stage(failed_steps):
+    """The late stages of a swing-up are the dear ones: they were promised."""
+    one = controller(pendulum(), pendulum_problem(), horizon=5)
+    many = ManyStarts(one)
+    stages = np.array([1.0, 1.0, 1.0, 5.0, 9.0, 9.0, 9.0, 9.0, 9.0])
+    states = np.arange(20.0).reshape(10, 2)
+
+    def costs(first):
+        five = stages[first : first + 5]
+        return FlownCosts(five, inputs=np.zeros(5), violations=np.zeros(5))
+
+    pursuit = _Pursuit.of_plan(np.zeros(2), costs(0), states[:6])
+    previous = one.control(Gaussian.certain(states[0]), Reference(np.zeros(2)))
+    previous = replace(previous, means=states[failed_steps : failed_steps + 6])
+    pursuit = pursuit.moved_to(previous, horizon=5)
+    now = failed_steps + 1
+    assert pursuit.costs.total.tolist() == stages[failed_steps:5].tolist()
+    assert not many._needs_new_search(costs(now), pursuit)
+    dearer = replace(costs(now), errors=1.5 * costs(now).errors)
+    assert many._needs_new_search(dearer, pursuit)

@@ -20,7 +20,6 @@ from gpmpc.mpc import (
     _control_step,
     gp_mpc,
 )
-from gpmpc.mpc._guess import initial_guess, read_request
 from gpmpc.mpc.baselines import NMPC
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, rollout
 from gpmpc.qp import CvxpySolver, DualActiveSet
@@ -429,22 +428,6 @@ def test_a_long_horizon_is_feasible_with_feedback_only():
     ).control(belief, reference)
     assert softened.status is Status.SOFT_BOUND_MISSED
     assert softened.violation > 1e-3
-
-
-def test_an_input_beyond_its_bound_by_rounding_is_no_soft_bound():
-    hard = Box([-1.0, -1.0], [1.0, 1.0], penalty=None)
-    problem = Problem(
-        Tracking([1.0, 1.0], [0.1]), Box([-1e5], [1e5]), constraints=[hard]
-    )
-    model = linear_gaussian(2, 1)
-    prediction = GPMPC(model, Linearization(), problem, 4, [0.0]).prediction
-    request = read_request(
-        prediction, Gaussian.certain(np.zeros(2)), Reference(np.zeros(2)), None
-    )
-    local = prediction.linearize(initial_guess(prediction, request), request)
-    inputs = np.full((4, 1), 1e5 + 2e-5)
-    ending = local._replace(plan=local.plan._replace(inputs=inputs))
-    assert prediction.end_of_solved(ending, violation=2e-5) is Status.SOLVED
 
 
 def test_soft_bounds_cost_what_they_are_said_to_cost():

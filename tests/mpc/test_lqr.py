@@ -8,7 +8,6 @@ from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.gaussian import Gaussian
 from gpmpc.models import linearize_by_autograd
 from gpmpc.mpc import Box, NonlinearGPMPC, Problem, Reference, Tracking, dlqr
-from gpmpc.mpc._riccati import finite_horizon_lqr
 from gpmpc.mpc.baselines import LQR
 from gpmpc.propagation import MeanEquivalence
 from gpmpc.status import Status
@@ -255,24 +254,6 @@ def test_a_state_that_requires_gradients_is_like_any_other():
     assert np.array_equal(
         ours.inputs, controller.control(Gaussian.certain([0.6, -0.4]), reference).inputs
     )
-
-
-def test_the_gain_of_a_long_horizon_is_stationary_and_exists(rng):
-    A = rng.normal(size=(1, 4, 4))
-    B = rng.normal(size=(1, 4, 2))
-    Q = np.eye(4)
-    R = np.eye(2)
-    gains, hessians = finite_horizon_lqr(A, B, Q[None], R[None], Q, 500)
-    varying, same = finite_horizon_lqr(
-        np.repeat(A, 500, axis=0), np.repeat(B, 500, axis=0), Q[None], R[None], Q, 500
-    )
-    assert np.allclose(gains[0], dlqr(A[0], B[0], Q, R), atol=1e-7)
-    assert np.allclose(gains, varying, atol=1e-7)
-    assert np.allclose(hessians, same, atol=1e-6)
-    unreachable, _ = finite_horizon_lqr(
-        2 * np.eye(4)[None], np.zeros((1, 4, 2)), Q[None], R[None], Q, 20
-    )
-    assert np.array_equal(unreachable, np.zeros((20, 2, 4)))
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 handed over."""
 
 from functools import partial
+from typing import NamedTuple
 
 import casadi
 import numpy as np
@@ -24,7 +25,6 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
-from gpmpc.mpc._linear_quadratic import Plan
 from gpmpc.mpc.baselines import LQR, NMPC, StateFormMPC
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
@@ -36,6 +36,14 @@ H = 7
 STATE = np.array([0.4, -0.3, 0.2])
 GOAL = Reference(np.array([0.1, 0.2, -0.1]), np.array([0.05, -0.1]))
 BOX = Box([-0.3] * 2, [0.25] * 2)
+
+
+class PlanOfThree(NamedTuple):
+    """What no controller takes for a plan."""
+
+    states: np.ndarray
+    inputs: np.ndarray
+    covariances: np.ndarray
 
 
 def planned(
@@ -326,9 +334,9 @@ def test_mistakes_are_one_clear_error():
     with pytest.raises(DataError, match="a plan to start from must be finite"):
         controller.control(at, GOAL, plan=np.full((7, 2), np.nan))
     last = controller.control(at, GOAL)
-    plan = Plan(last.means, last.inputs, last.covariances)
+    plan = PlanOfThree(last.means, last.inputs, last.covariances)
     with pytest.raises(
-        ShapeError, match=r"or a pair \(inputs, states\); got a Plan of 3"
+        ShapeError, match=r"or a pair \(inputs, states\); got a PlanOfThree of 3"
     ):
         controller.control(at, GOAL, plan=plan)
 

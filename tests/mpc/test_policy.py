@@ -6,7 +6,6 @@ import pytest
 from gpmpc.exceptions import SettingError, SolverFailure
 from gpmpc.gaussian import Gaussian
 from gpmpc.mpc import Box, ControlLoop, Decision, Problem, Reference, Timing, Tracking
-from gpmpc.mpc._policy import decide
 from gpmpc.status import Status
 
 STATE = Gaussian.certain(np.zeros(1))
@@ -39,13 +38,12 @@ class Planner:
 
 
 def run(planner, steps, on_failure, beliefs=None, reference=FAR):
-    last = None
+    loop = ControlLoop(planner, on_failure)
     commands = []
     for k in range(steps):
-        last = decide(
-            planner, beliefs[k] if beliefs else STATE, reference, last, on_failure, k
-        )
-        commands.append(last)
+        applied = loop.input(beliefs[k] if beliefs else STATE, reference)
+        assert np.array_equal(applied, loop.last.input)
+        commands.append(loop.last)
     return commands
 
 
@@ -147,14 +145,13 @@ def test_before_the_first_plan_the_reference_input_is_applied():
 def test_before_a_plan_each_step_applies_its_reference_input(on_failure):
     """What was applied for want of a plan is no plan, and is not gone on along."""
     planner = Planner(0, 1, 2)
-    last = None
+    loop = ControlLoop(planner, on_failure)
     applied = []
     for k in range(4):
         reference = Reference(np.zeros((5, 1)), 100.0 + k + np.arange(4.0)[:, None])
-        last = decide(planner, STATE, reference, last, on_failure, k)
-        applied.append(last.input[0])
+        applied.append(loop.input(STATE, reference)[0])
     assert applied == [100, 101, 102, 30]
-    assert last.plan.status.solved
+    assert loop.last.plan.status.solved
 
 
 class Odd(Planner):

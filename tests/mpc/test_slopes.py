@@ -19,6 +19,7 @@ from gpmpc.mpc import GPMPC, Box, Problem, Tracking
 from gpmpc.mpc._slopes import slope_covariances
 from gpmpc.propagation import Linearization
 from gpmpc.systems import System, step_many
+from tests.gp.their_models import matern_dynamics
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +78,15 @@ def test_models_around_a_gp_are_looked_through(gp):
     assert noisy == pytest.approx(slope_covariances(gp, STATE, INPUT))
     nominal = KnownModel(Affine.identity(2, 1), 2, 1)
     assert not slope_covariances(nominal, STATE, INPUT).any()
+    of_any_kernel = ResidualModel(
+        Affine.identity(2, 1),
+        residual=matern_dynamics("value"),
+        B=torch.eye(2, dtype=torch.float64),
+        states=[0, 1],
+        inputs=[0],
+        input_dim=1,
+    )
+    assert not slope_covariances(of_any_kernel, STATE, INPUT).any()
 
 
 def test_an_angle_is_seen_through_its_sine_and_cosine():

@@ -26,8 +26,6 @@ from gpmpc.mpc import (
     Tracking,
     kicks,
 )
-from gpmpc.mpc._stage_meter import FlownCosts
-from gpmpc.mpc._starts import _Pursuit
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from gpmpc.systems import cart_pole, double_pendulum, pendulum, step
@@ -687,29 +685,6 @@ def test_the_novelty_of_a_followed_flight_is_of_its_plan():
     )
     assert callable(measure)
     assert decision.novelty == pytest.approx(measure(), rel=1e-9)
-
-
-@pytest.mark.parametrize("failed_steps", [0, 1, 3])
-def test_after_failed_steps_a_plan_is_compared_stage_by_stage(failed_steps):
-    """The late stages of a swing-up are the dear ones: they were promised."""
-    one = controller(pendulum(), [1.0, 0.01], [0.01], 5)
-    many = ManyStarts(one)
-    stages = np.array([1.0, 1.0, 1.0, 5.0, 9.0, 9.0, 9.0, 9.0, 9.0])
-    states = np.arange(20.0).reshape(10, 2)
-
-    def costs(first):
-        five = stages[first : first + 5]
-        return FlownCosts(five, inputs=np.zeros(5), violations=np.zeros(5))
-
-    pursuit = _Pursuit.of_plan(np.zeros(2), costs(0), states[:6])
-    previous = one.control(Gaussian.certain(states[0]), Reference(np.zeros(2)))
-    previous = replace(previous, means=states[failed_steps : failed_steps + 6])
-    pursuit = pursuit.moved_to(previous, horizon=5)
-    now = failed_steps + 1
-    assert pursuit.costs.total.tolist() == stages[failed_steps:5].tolist()
-    assert not many._needs_new_search(costs(now), pursuit)
-    dearer = replace(costs(now), errors=1.5 * costs(now).errors)
-    assert many._needs_new_search(dearer, pursuit)
 
 
 def test_a_planner_of_another_horizon_is_refused():

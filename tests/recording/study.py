@@ -20,10 +20,9 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 import numpy as np
 
-from gpmpc.cli._commands import COMMANDS
-from gpmpc.cli._log import log
 from gpmpc.exceptions import GpmpcError
 from gpmpc.recording import layout, read_run, recover, replay
+from tests.cli.command import called
 from tests.recording import damage
 
 # enough to see how much too much is taken
@@ -91,8 +90,9 @@ def outcome(operation, path, original):
     )
 
 
-def given(*arguments):
-    return COMMANDS["log"].parser("log").parse_args(arguments)
+def gpmpc_log(action, *paths):
+    """Runs the command; an error of it is raised as it is."""
+    called("log", action, *map(str, paths), "--debug", cwd=paths[0].parent)
 
 
 def operations(path):
@@ -112,11 +112,8 @@ def operations(path):
     yield "read", lambda: read_run(path)
     yield "layout", lambda: layout(read_run(path)) and None
     yield "replay", replays
-    yield "info", lambda: log(given("info", str(path))) and None
-    yield (
-        "export",
-        lambda: log(given("export", str(path), str(path.with_suffix(".csv")))) and None,
-    )
+    yield "info", lambda: gpmpc_log("info", path)
+    yield "export", lambda: gpmpc_log("export", path, path.with_suffix(".csv"))
     yield "recover", lambda: recover(path, recovered) and None
     if recovered.exists():
         yield "recovered", lambda: read_run(recovered)

@@ -15,11 +15,11 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from gpmpc.cli._log import condition
 from gpmpc.exceptions import RecordingError, SettingError, ShapeError
 from gpmpc.qp import DualActiveSet, QuadraticProgram
 from gpmpc.recording import RecordedSystem, _recorder, read_run, replay
 from gpmpc.status import Status
+from tests.cli.command import called
 from tests.recording import runs
 
 
@@ -313,7 +313,8 @@ def test_a_run_that_ends_in_an_error_is_recorded_up_to_there(tmp_path):
     # the file is whole, and the flight was not
     assert run.finished
     assert run.ended_by == "ZeroDivisionError: too bad"
-    assert condition(run) == "the flight ended early: ZeroDivisionError: too bad"
+    told = called("log", "info", path.name, cwd=tmp_path, COLUMNS="160")
+    assert "the flight ended early: ZeroDivisionError: too bad" in told.stdout
 
 
 def test_a_recorded_step_is_a_copy(tmp_path):

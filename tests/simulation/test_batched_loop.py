@@ -19,7 +19,6 @@ from gpmpc.mpc import (
     Timing,
     Tracking,
 )
-from gpmpc.mpc._policy import decide_many
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.simulation import Dropout, Gust, ModelLoop, Noise, closed_loop, closed_loops
 from gpmpc.status import Status
@@ -301,18 +300,16 @@ def test_flights_with_the_model_on_a_gpu_are_those_on_the_cpu(covariance, propag
         assert_same(ours.result, theirs.result)
 
 
-class Doubling(GPMPC):
+class Lifting(GPMPC):
     """Overrides ``control`` alone."""
 
     def control(self, *arguments, **options):
         decision = super().control(*arguments, **options)
-        return replace(decision, disturbance=np.full(6, 7.0))
+        return replace(decision, input=HOVER + 1.0, inputs=np.tile(HOVER + 1.0, (H, 1)))
 
 
 def test_a_control_that_is_overridden_alone_decides_for_many():
     problem = Problem(Tracking([1.0] * 6, [0.1] * 3))
-    controller = Doubling(GP, Linearization(), problem, H, HOVER)
-    beliefs = [Gaussian.certain(START), Gaussian.certain(-START)]
-    reference = Reference(np.zeros((H + 1, 6)))
-    commands = decide_many(controller, beliefs, reference, [None, None])
-    assert [command.decision.disturbance[0] for command in commands] == [7.0, 7.0]
+    controller = Lifting(GP, Linearization(), problem, H, HOVER)
+    for trial in fly(controller, seeds=2, noise=None):
+        assert np.array_equal(trial.result.inputs, np.tile(HOVER + 1.0, (STEPS, 1)))

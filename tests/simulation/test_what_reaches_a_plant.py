@@ -8,8 +8,7 @@ import pytest
 
 from gpmpc.exceptions import ShapeError, SolverFailure
 from gpmpc.gaussian import Gaussian
-from gpmpc.mpc import Box, Decision, Problem, Reference, Timing, Tracking
-from gpmpc.mpc._policy import decide, decide_many
+from gpmpc.mpc import Box, ControlLoop, Decision, Problem, Reference, Timing, Tracking
 from gpmpc.propagation import Linearization
 from gpmpc.simulation import Cascade, ModelLoop, cascade_loop, closed_loop, closed_loops
 from gpmpc.status import Status
@@ -181,22 +180,27 @@ def test_many_at_once_are_looked_at_one_by_one(kind):
 def test_a_loop_of_ones_own_is_stopped_where_the_policy_says_so(kind):
     state = Gaussian.certain(START)
     reference = Reference(REFERENCES.states[: H + 1])
+    stopped = ControlLoop(Liar({2: kind}), "raise")
+    for _ in range(2):
+        stopped.input(state, reference)
     with pytest.raises(
         SolverFailure,
-        match="step 7: its plan, SOLVED, is not finite or out of its bounds or shape",
+        match="step 2: its plan, SOLVED, is not finite or out of its bounds or shape",
     ):
-        decide(Liar({0: kind}), state, reference, None, "raise", 7)
-    (first,) = decide_many(Liar({0: kind}), [state], reference, [None], "hold", 7)
-    assert first.failed
-    assert np.array_equal(
-        first.input, Liar.initial_input
-    )  # there is nothing else to hold
-    good = decide(Liar(), state, reference)
-    command = decide(Liar({0: kind}), state, reference, good, "hold")
-    assert command.failed
-    assert command.status is Status.NUMERICAL_TROUBLE
-    assert np.array_equal(command.input, good.input)
-    assert command.decision is None or not command.decision.applicable
+        stopped.input(state, reference)
+    together = [np.zeros((H + 1, 6)), START, 1, 1]
+    (first,) = closed_loops(QUADROTOR, Liar({0: kind}), *together, on_failure="hold")
+    assert len(first.result.failures) == 1
+    # there is nothing else to hold
+    assert np.array_equal(first.result.inputs[0], Liar.initial_input)
+    loop = ControlLoop(Liar(), "hold")
+    good = loop.input(state, reference)
+    assert not loop.last.failed
+    loop.controller = Liar({0: kind})
+    assert np.array_equal(loop.input(state, reference), good)
+    assert loop.last.failed
+    assert loop.last.status is Status.NUMERICAL_TROUBLE
+    assert loop.last.decision is None or not loop.last.decision.applicable
 
 
 def test_what_misses_a_bound_by_rounding_is_put_onto_it():
@@ -213,9 +217,9 @@ def test_what_misses_a_bound_by_rounding_is_put_onto_it():
                 Timing(0.0, 0.0, 0.0),
             )
 
-    command = decide(
-        Loose(), Gaussian.certain(START), Reference(REFERENCES.states[: H + 1])
-    )
+    loop = ControlLoop(Loose(), "raise")
+    loop.input(Gaussian.certain(START), Reference(REFERENCES.states[: H + 1]))
+    command = loop.last
     assert command.input.tolist() == [7.5, 0.1, -0.1 + 1e-7]
     assert (
         command.plan.inputs[0].tolist()
@@ -228,12 +232,12 @@ def test_what_misses_a_bound_by_rounding_is_put_onto_it():
 def test_a_non_finite_reference_is_no_fallback():
     lost = Gaussian.certain(START * np.nan)
     reference = Reference(REFERENCES.states[: H + 1], np.full((H, 3), np.nan))
-    command = decide(Liar(), lost, reference, None, "hold")
-    assert np.array_equal(command.input, Liar.initial_input)
+    held = ControlLoop(Liar(), "hold").input(lost, reference)
+    assert np.array_equal(held, Liar.initial_input)
     controller = Liar()
     controller.initial_input = None
     with pytest.raises(SolverFailure, match="no reference input to fall back on"):
-        decide(controller, lost, reference, None, "hold")
+        ControlLoop(controller, "hold").input(lost, reference)
 
 
 def test_without_declared_bounds_inputs_are_finite_and_as_many():

@@ -5,6 +5,7 @@ import json
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 from rich.console import Console
 
 from gpmpc.gp import Trainer
@@ -15,6 +16,7 @@ from gpmpc.studies._document import terminal
 from gpmpc.studies._run_folder import PLAN_PREFIX, RunFolder, folder_name, run_header
 from gpmpc.studies.flight import Experiment, Flown, metrics
 from gpmpc.studies.report import report_document
+from gpmpc.studies.study import Document, Table
 from gpmpc.systems import translational
 
 SETTINGS = {
@@ -73,6 +75,12 @@ def record_of(settings, choices=()):
     return run_header(list(choices), settings, "gpmpc run")
 
 
+def shown_number(value):
+    """How a document shows a number."""
+    document = Document("", [Table(["x"], [[value]])], pd.DataFrame())
+    return document.markdown().split("|")[-2].strip()
+
+
 def on_terminal(table, width):
     """The text of a table on a terminal of ``width`` columns."""
     stream = io.StringIO()
@@ -114,3 +122,15 @@ def documents(report, comparison=()):
     """Every file of a report, by name."""
     document = report_document(report, comparison)
     return document.files("report") | {"report.html": document.html()}
+
+
+def lose(tree, choices, command="gpmpc run"):
+    """Leaves a run whose process died before it could say what its settings were."""
+    about = {
+        "choices": choices,
+        "settings": {},
+        "provenance": {"command": command},
+    }
+    RunFolder(folder_of(tree, choices)).end_from_outside(
+        "its process died", "crash", about
+    )

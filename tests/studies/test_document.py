@@ -200,6 +200,23 @@ def test_a_terminal_shows_sections_details_and_notes():
     )
 
 
+def test_a_terminal_aligns_names_left_and_numbers_right():
+    console = Console(width=80)
+    with console.capture() as capture:
+        console.print(
+            terminal(
+                [Table(["system", "error"], [["cart", 0.25], ["quadrotor", 12.5]])]
+            )
+        )
+    cart, quadrotor = (
+        line.rstrip()
+        for line in capture.get().splitlines()
+        if "cart" in line or "quad" in line
+    )
+    assert cart.index("cart") == quadrotor.index("quadrotor")
+    assert len(cart) == len(quadrotor)
+
+
 def test_a_spreadsheet_reads_numbers_and_no_formulas():
     assert DOCUMENT.csv() == "'=name,n\n'@x,1.5\n-2.5e-3,2.0\n'-a,3.0\n"
 
@@ -237,6 +254,10 @@ def test_a_document_of_a_title_and_a_table_is_no_more_than_that():
         (999.4, "999"),
         (999.6, "1.00e3"),
         (1234.0, "1.23e3"),
+        (1.234e-7, "1.23e-7"),
+        (0.01234, "0.0123"),
+        (1.4567, "1.46"),
+        (12345.0, "1.23e4"),
         (-1e4, "-1.00e4"),
         (1e100, "1.00e100"),
         (float("inf"), "inf"),

@@ -8,9 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hydra import compose, initialize_config_dir
 
-from gpmpc.cli._experiment import experiment_of
 from gpmpc.datasets import Excitation, ExcitedData
 from gpmpc.exceptions import Diverged, SettingError
 from gpmpc.gp import Trainer, Transitions
@@ -20,10 +18,10 @@ from gpmpc.propagation import Linearization
 from gpmpc.simulation import Noise
 from gpmpc.status import Status
 from gpmpc.studies import _trial
-from gpmpc.studies._run_folder import Busy, RunFolder, folder_name
 from gpmpc.studies.flight import Experiment, metrics, run_trial
 from gpmpc.systems import coupled, pendulum, rotational, translational
 from gpmpc.trajectories import Elliptical, Hover, Lorenz, Step
+from tests.systems.experiments import experiment as experiment_of
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 PLANT = translational()
@@ -315,16 +313,10 @@ def learned():
 
 @pytest.mark.parametrize("choice", composed())
 def test_the_rehearsal_changes_no_bit(choice, learned, monkeypatch):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        tiny = ["data.samples=20", "model.restarts=0", "steps=4", "horizon=3"]
-        noise = (
-            []
-            if choice == "loop=model"
-            else [f"noise.process={[1e-3] * 6}", f"noise.measurement={[1e-3] * 6}"]
-        )
-        settings = learned(
-            experiment_of(compose("run", overrides=[choice, *tiny, *noise]))
-        )
+    words = ["data.samples=20", "model.restarts=0", "steps=4", "horizon=3"]
+    if choice != "loop=model":
+        words += [f"noise.process={[1e-3] * 6}", f"noise.measurement={[1e-3] * 6}"]
+    settings = learned(experiment_of(choice, *words))
     rehearsed = run_trial(settings).rollout
     monkeypatch.setattr(_trial, "rehearse", lambda *_: None)
     at_once = run_trial(settings).rollout
@@ -349,48 +341,6 @@ def test_more_rows_than_there_are_are_refused():
         match="data.size: must be at most 25, the rows of the data; got 26",
     ):
         run_trial(experiment(size=26))
-
-
-def test_one_process_works_on_a_folder_until_it_has_metrics(tmp_path):
-    folder = RunFolder(tmp_path / "run")
-    with folder.locked():
-        with pytest.raises(Busy), RunFolder(tmp_path / "run").locked(wait=False):
-            pass
-        folder.fail(ValueError("no\nluck"), {})
-        assert not folder.finished
-        assert folder.failed_at
-        folder.begin("steps: 1")
-        assert folder.failed_at is None
-        folder.finish({"rmse": 1, "settings": {}})
-    assert folder.finished
-    assert folder.result() == {"rmse": 1, "settings": {}}
-    with folder.locked(wait=False):
-        pass
-    assert sorted(path.name for path in folder.path.iterdir()) == [
-        ".lock",
-        "config.yaml",
-        "metrics.json",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("one", "other"),
-    [
-        (["a=x/y"], ["a=x_y"]),
-        (["a=X"], ["a=x"]),
-        (["a=" + "1" * 300], ["a=" + "1" * 301]),
-        (["a=1", "b=2"], ["a=1,b=2"]),
-    ],
-    ids=["characters", "case", "length", "commas"],
-)
-def test_folders_of_different_choices_never_collide(one, other):
-    names = [folder_name(choices) for choices in (one, other)]
-    assert names[0].lower() != names[1].lower()
-    assert all(len(name) < 200 and "/" not in name for name in names)
-
-
-def test_the_order_of_choices_does_not_matter_for_the_name():
-    assert folder_name(["b=2", "a=1"]) == folder_name(["a=1", "b=2"]) == "a=1,b=2"
 
 
 @pytest.mark.parametrize(

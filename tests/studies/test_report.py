@@ -13,14 +13,12 @@ from urllib.parse import unquote
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from gpmpc.cli._overrides import read_override
-from gpmpc.cli._recorded import recordings
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.plotting import Series, over_variable
 from gpmpc.studies import report as reporting
-from gpmpc.studies._run_folder import RunFolder, folder_override
 from gpmpc.studies.report import (
     compare,
     notes,
@@ -29,12 +27,14 @@ from gpmpc.studies.report import (
     sentences,
     terminal_table,
 )
+from tests.cli.command import called
 from tests.studies.made_up import (
     SETTINGS,
     add,
     chosen,
     documents,
     folder_of,
+    lose,
     made_up_run,
     metrics_of,
     plan,
@@ -83,18 +83,6 @@ def test_the_gaps_come_with_the_command_that_fills_them(tree):
     assert read_report(tree).commands() == [
         f"gpmpc run -m controller=lqr seed=6,7 folder={tree}"
     ]
-
-
-def lose(tree, choices, command="gpmpc run"):
-    """Leaves a run whose process died before it could say what its settings were."""
-    about = {
-        "choices": choices,
-        "settings": {},
-        "provenance": {"command": command},
-    }
-    RunFolder(folder_of(tree, choices)).end_from_outside(
-        "its process died", "crash", about
-    )
 
 
 def test_gaps_of_runs_without_a_seed_are_filled_without_one(tmp_path):
@@ -584,16 +572,18 @@ def test_a_setting_that_is_left_out_is_a_choice(tmp_path):
     assert command.endswith(f"'~noise' seed=1 folder={tmp_path / 'tree'}")
 
 
-def test_a_command_names_a_folder_as_hydra_reads_it(tmp_path):
-    for name in ("a,b", "x(1)", "it's", "plain-1.5", "nul", "ü"):
-        tree = tmp_path / name
+def test_a_command_names_a_folder_as_hydra_reads_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    parser = OverridesParser.create()
+    whole = [tmp_path / name for name in ("a,b", "x(1)", "it's", "plain-1.5", "nul")]
+    numbers_and_words = map(Path, ("1", "1e5", ".5", "true", "null", "inf"))
+    for tree in (*whole, tmp_path / "ü", *numbers_and_words):
         plan(tree, [["seed=1"], ["seed=2"]])
         add(tree, "convex", 1, 0.1)
         (command,) = read_report(tree).commands()
         *_, word = shlex.split(command)
-        assert read_override(word).value == str(tree)
-    for name in ("1", "1e5", ".5", "true", "null", "inf"):
-        assert read_override(folder_override(Path(name))).value == name
+        folder = parser.parse_override(word).value()
+        assert getattr(folder, "text", folder) == str(tree)
 
 
 def fly(tree, choices, unit="m", error=0.1, command="gpmpc run", **settings):
@@ -701,4 +691,5 @@ def test_runs_behind_links_are_found_once(tmp_path):
     report = read_report(tree)
     assert [*report.runs.state] == ["finished", "finished"]
     assert report.repeated == ()
-    assert len(recordings(tree)) == 2
+    judged = called("calibrate", "tree", cwd=tmp_path)
+    assert judged.stderr.startswith("gpmpc: tree: holds 2 runs")

@@ -1,9 +1,7 @@
 """A measure that is zero in every run takes no column where there is little room."""
 
 import pytest
-from rich.console import Console
 
-from gpmpc.studies._document import Table, terminal
 from gpmpc.studies.report import read_report, terminal_table
 from tests.studies.made_up import documents, made_up_run, metrics_of
 
@@ -47,20 +45,3 @@ def test_a_comparison_stands_in_the_page_and_in_the_text(tmp_path):
         assert all(
             line in with_it and line not in without for line in [*lines, "Comparison"]
         )
-
-
-def test_a_terminal_aligns_names_left_and_numbers_right():
-    console = Console(width=80)
-    with console.capture() as capture:
-        console.print(
-            terminal(
-                [Table(["system", "error"], [["cart", 0.25], ["quadrotor", 12.5]])]
-            )
-        )
-    cart, quadrotor = (
-        line.rstrip()
-        for line in capture.get().splitlines()
-        if "cart" in line or "quad" in line
-    )
-    assert cart.index("cart") == quadrotor.index("quadrotor")
-    assert len(cart) == len(quadrotor)

@@ -238,3 +238,45 @@ def test_settings_of_nan_do_not_differ_from_themselves():
     assert difference(settings(2.0), settings(3)).startswith(
         "gains: [{'a': nan}, 2.0] "
     )
+
+
+def test_one_process_works_on_a_folder_until_it_has_metrics(tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    with folder.locked():
+        with pytest.raises(Busy), RunFolder(tmp_path / "run").locked(wait=False):
+            pass
+        folder.fail(ValueError("no\nluck"), {})
+        assert not folder.finished
+        assert folder.failed_at
+        folder.begin("steps: 1")
+        assert folder.failed_at is None
+        folder.finish({"rmse": 1, "settings": {}})
+    assert folder.finished
+    assert folder.result() == {"rmse": 1, "settings": {}}
+    with folder.locked(wait=False):
+        pass
+    assert sorted(path.name for path in folder.path.iterdir()) == [
+        ".lock",
+        "config.yaml",
+        "metrics.json",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (["a=x/y"], ["a=x_y"]),
+        (["a=X"], ["a=x"]),
+        (["a=" + "1" * 300], ["a=" + "1" * 301]),
+        (["a=1", "b=2"], ["a=1,b=2"]),
+    ],
+    ids=["characters", "case", "length", "commas"],
+)
+def test_folders_of_different_choices_never_collide(one, other):
+    names = [folder_name(choices) for choices in (one, other)]
+    assert names[0].lower() != names[1].lower()
+    assert all(len(name) < 200 and "/" not in name for name in names)
+
+
+def test_the_order_of_choices_does_not_matter_for_the_name():
+    assert folder_name(["b=2", "a=1"]) == folder_name(["a=1", "b=2"]) == "a=1,b=2"

@@ -7,8 +7,8 @@ import pytest
 pytest.importorskip("optuna")
 
 from gpmpc.studies import tuning
-from gpmpc.studies._document import number
 from gpmpc.studies.tuning import Interval, Search
+from tests.studies.made_up import shown_number
 
 SPACE = {
     "weight": Interval(1e-3, 1e3, logarithmic=True),
@@ -133,7 +133,7 @@ def test_a_document_holds_the_ten_best_and_the_data_holds_all(monkeypatch):
     shown = [(1, "2"), (3, "2"), (0, "5"), *((i, str(i + 1)) for i in range(5, 12))]
     of = search.candidates
     assert best.rows == [
-        [str(i), cost, number(of[i]["w.$x"]), str(of[i]["n"]), "a\\n"]
+        [str(i), cost, shown_number(of[i]["w.$x"]), str(of[i]["n"]), "a\\n"]
         for i, cost in shown
     ]
     assert (matter.title, matter.header) == ("What mattered", ["setting", "importance"])

@@ -4,6 +4,7 @@ import pytest
 
 from gpmpc.exceptions import SettingError
 from gpmpc.systems import (
+    GRAVITY,
     Coupled,
     Rotational,
     System,
@@ -11,9 +12,16 @@ from gpmpc.systems import (
     attitude_for_thrust_direction,
     step,
 )
-from gpmpc.systems._quadrotor import thrust_direction
 
 QUARTER = np.pi / 4
+
+
+def thrust_direction(phi, theta, psi):
+    """Where the thrust pulls: the acceleration of a unit mass by a unit thrust."""
+    x = np.zeros((12, *np.shape(phi)))
+    x[[6, 8, 10]] = phi, theta, psi
+    rates = Coupled(mass=1.0).derivative(x, [1.0, 0.0, 0.0, 0.0])
+    return rates[1], rates[3], GRAVITY - rates[5]
 
 
 def test_the_names_are_those_of_the_subsystems():
