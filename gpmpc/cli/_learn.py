@@ -265,12 +265,13 @@ class _Split(NamedTuple):
 
         Args:
             past: Rows that a model looks back on. What comes before the last rows of a
-                run may be of those that were learned from.
+                run may be of those that were learned from, as may be the row from which
+                the first of them is predicted.
         """
         if self.run is None:
             return self.held_out_rows
         first = len(self.run) - len(self.held_out_rows)
-        first -= max(past, PAST)
+        first -= max(past, PAST) + 1
         rows = self.run.part(max(first, 0), len(self.run), "last part")
         return replace(self.held_out_rows, runs=(rows,))
 

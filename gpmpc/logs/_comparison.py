@@ -90,21 +90,20 @@ def independent_predictions(windows: Windows, steps: Sequence[int]) -> Array:
         windows: From whose starts is predicted.
         steps: After the starts.
     """
-    return predictions_of_pieces(
-        windows.stride * _windows_of_pieces(windows), np.maximum(steps, windows.stride)
-    )
+    stride = windows.stride
+    starts = stride * (_windows_of_pieces(windows) - 1) + 1
+    return predictions_of_pieces(starts, np.maximum(steps, stride))
 
 
 def predictions_of_pieces(starts: Array, steps: Array) -> Array:
     """Counts the predictions (steps,) of pieces that do not overlap.
 
     Args:
-        starts: Rows from which is predicted, of each piece (pieces,), one at least.
+        starts: Rows from the first to the last start of each piece (pieces,), one at
+            least.
         steps: After the starts (steps,).
     """
-    has_several = starts >= steps[:, None]  # (steps, pieces)
-    rows = np.where(has_several, starts, 0).sum(axis=1)
-    return rows / steps + (~has_several).sum(axis=1)
+    return (1 + (starts - 1) / steps[:, None]).sum(axis=1)
 
 
 def _windows_of_pieces(windows: Windows) -> Array:

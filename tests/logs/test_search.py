@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from gpmpc.cli._learn import _doubt_of_held_out, _Split
+from gpmpc.cli._learn import _doubt_of_held_out, _Split, _split
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.gp import train
 from gpmpc.logs import Judgement, Log, LogMapping, fit_nominal, judge, learn
@@ -549,7 +549,21 @@ def test_predictions_of_different_pieces_are_independent(are_pieces):
     learned = SimpleNamespace(model=SimpleNamespace(past=20))
     assert most_told_steps(learned, log) == 50
     one_run = log_of(np.zeros((1, 71, 2)), np.zeros((1, 71, 1)))
-    assert most_told_steps(learned, one_run) == 51 // 5
+    assert most_told_steps(learned, one_run) == 50 // 4
+
+
+def test_a_fifth_of_a_thousand_rows_tells_fifty_steps_ahead():
+    values = np.random.default_rng(0).standard_normal((1, 1000, 2))
+    split = _split(log_of(values, values[..., :1]), [])
+    held_out = split.held_out(40)
+    model = SimpleNamespace(past=40)
+    assert most_told_steps(SimpleNamespace(model=model), held_out) == 50
+    windows = held_out.windows(50, past=40)
+    assert independent_predictions(windows, [50]) == 4
+    # The first one is predicted from the last row that was learned from.
+    last_row = split.train.runs[0].states[-1]
+    np.testing.assert_array_equal(windows.states[0, 40], last_row)
+    assert len(split.held_out_rows) == len(windows) + 50 - 1
 
 
 def test_steps_that_were_asked_for_decide():
