@@ -111,7 +111,10 @@ def _findings(path: Path, csv: CsvText, swallowed: int) -> Iterator[Finding]:
         text = f"{lines} before the rows without names of columns: left out"
         yield Finding("lines before the rows", run, csv.skipped, text)
     if not csv.names:
-        text = "no line names the columns: they are called by their numbers, 1, 2, ..."
+        text = (
+            "no line names the columns: where a mapping has no names for them, they "
+            "are called by their numbers, 1, 2, ..."
+        )
         yield Finding("no names", run, csv.columns, text)
     blank = len(csv.rows_behind_blank)
     if blank:

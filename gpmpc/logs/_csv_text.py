@@ -480,8 +480,11 @@ def _are_units(fields: Fields, names: Fields) -> bool:
     """Tells whether fields below names are units, such as ``[s]`` and ``N m``.
 
     All are known, or one is a unit of times and stands below the name of a time: then
-    others are units that are not known here.
+    others are units that are not known here. Fields that come twice below names that
+    do not are no names: RAD below THE and PHI.
     """
+    if len({*fields}) < len(fields) and len({*names}) == len(names):
+        return True
     units = [field.strip("[]() ") for field in fields]
     are_known = all(
         is_known(unit) or _BRACKETS.fullmatch(field)

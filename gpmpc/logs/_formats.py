@@ -41,6 +41,8 @@ READERS: dict[str, LogReader] = {
     ".txt.gz": read_csv,
     ".dat": read_csv,
     ".dat.gz": read_csv,
+    ".asc": read_csv,
+    ".asc.gz": read_csv,
     ".parquet": read_parquet,
     ".npz": read_npz,
     ".mat": read_mat,

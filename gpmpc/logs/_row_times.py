@@ -32,6 +32,11 @@ from gpmpc.logs._units import (
 # columns that hold the time where nobody says which
 TIMES = (STAMP, *NAMES_OF_TIMES)
 _CLOCK = re.compile(r"\s*\d+:\d\d:\d\d(?:\.\d+)?\s*")
+# the year first, and other marks than ISO's between the parts: 2024_05_01_12_00_00_500
+_PARTS_OF_DATE = re.compile(
+    r"^\s*(\d{4})[-_/.](\d\d?)[-_/.](\d\d?)[-_ T]+(\d\d?)[-_:.](\d\d?)"
+    r"[-_:.](\d\d?)(?:[-_:.,](\d+))?\s*$"
+)
 _WITH_UNIT = re.compile(r"^\s*(-?\d+(?:\.\d+)?)\s*([^\W\d_]+)\s*$")
 _SAMPLE = 50  # rows in which texts are looked at: are they dates?
 _SAME_SPAN = 0.02  # of the time that a log took: a clock in its messages goes as far
@@ -208,9 +213,9 @@ def unit_of_clock(table: pd.DataFrame, column: str) -> str:
 def read_dates(table: pd.DataFrame, column: str) -> Array | None:
     """Reads dates or durations (K,) [s] that are texts; None of anything else.
 
-    Dates, such as 2024-05-01 12:00:00, are in ISO's format alone: in others, the day
-    and the month may be confused. They come out since 1970. Durations are as a clock
-    shows them, 00:01:02.5, or have their unit, 62.5 sec.
+    Dates begin with the year, as 2024-05-01 12:00:00 and 2024_05_01_12_00_00_500 do:
+    in others, the day and the month may be confused. They come out since 1970.
+    Durations are as a clock shows them, 00:01:02.5, or have their unit, 62.5 sec.
     """
     texts = table[column]
     if texts.dtype.kind in "biufmM" or pd.to_numeric(texts, errors="coerce").any():
@@ -218,11 +223,28 @@ def read_dates(table: pd.DataFrame, column: str) -> Array | None:
     durations = _read_durations(texts)
     if durations is not None:
         return durations
-    dates = pd.to_datetime(texts, format="ISO8601", utc=True, errors="coerce")
+    dates = _read_iso_dates(texts)
+    if dates.isna().all():
+        dates = _read_iso_dates(_in_iso_format(texts))
     is_wrong = dates.isna() & ~texts.isna()
     if is_wrong.any() or dates.isna().all():
         return None
     return seconds(dates)
+
+
+def _read_iso_dates(texts: pd.Series) -> pd.Series:
+    return pd.to_datetime(texts, format="ISO8601", utc=True, errors="coerce")
+
+
+def _in_iso_format(texts: pd.Series) -> pd.Series:
+    """Writes dates whose year comes first as ISO does; other texts are missing."""
+    parts = texts.astype("string").str.extract(_PARTS_OF_DATE)
+    year, month, day, hour, minute, second = (
+        parts[index].str.zfill(2) for index in range(6)
+    )
+    fraction = parts[6].fillna("0")
+    date = year + "-" + month + "-" + day
+    return date + "T" + hour + ":" + minute + ":" + second + "." + fraction
 
 
 def _read_durations(texts: pd.Series) -> Array | None:

@@ -264,6 +264,15 @@ def test_counted_columns_are_no_row(tmp_path):
     np.testing.assert_array_equal(log.runs[0].states[:, 0], TABLE["x"])
 
 
+def test_units_in_capitals_are_no_names(tmp_path):
+    rows = TEXT.partition("\n")[2].replace(",", " ")
+    header = "values of a flight\n\nT THE PHI\nS RAD RAD\n"
+    (tmp_path / "log.asc").write_text(header + rows)
+    mapping = {"time": "T", "states": {"pitch": ["THE"]}, "inputs": {"roll": ["PHI"]}}
+    log = read_log(tmp_path / "log.asc", mapping)
+    np.testing.assert_array_equal(log.runs[0].states[:, 0], TABLE["x"])
+
+
 def test_a_run_that_comes_twice_is_found(tmp_path):
     for name in ("flight.csv", "flight (1).csv"):
         (tmp_path / name).write_text(TEXT)

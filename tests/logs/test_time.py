@@ -427,7 +427,11 @@ def test_what_is_no_unit_of_times_is_asked_for(tmp_path, header):
 
 
 @pytest.mark.parametrize(
-    "text", ["00:01:{:05.2f}", "{:.2f} sec", "{:.4f} s", "2024-05-01 12:00:{:05.2f}"]
+    "text",
+    [
+        *("00:01:{:05.2f}", "{:.2f} sec", "{:.4f} s", "2024-05-01 12:00:{:05.2f}"),
+        *("2024_5_1_12_00_{:05.2f}", "2024/05/01 12:00:{:05.2f}"),
+    ],
 )
 def test_times_in_texts_are_read(tmp_path, text):
     rows = [f"{text.format(0.5 * k)},{k % 7},{k % 3}\n" for k in range(60)]
