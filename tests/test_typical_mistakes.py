@@ -897,8 +897,12 @@ COMMANDS = {
     "plot log.csv": "log.csv: is not an MCAP file",
     "log inspect no.csv": "no.csv: no such file",
     "report nowhere": "nowhere: no such folder",
-    "learn no.yaml log.csv": "mapping: no.yaml cannot be read",
+    "run trajectory=": "trajectory: choose one of elliptical, goal, hover, lorenz",
+    "learn no.yaml log.csv": (
+        "mapping: no.yaml cannot be read (No such file or directory)\n"
+    ),
     "new 2arm": "NAME: must be letters, digits and _",
+    "new class": "NAME: class is the name of a keyword of Python",
 }
 
 

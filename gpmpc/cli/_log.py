@@ -35,13 +35,17 @@ _SUFFIXES = {
 
 def condition(run: Run) -> str:
     """Says what a recording lacks, and what ended its flight early; else nothing."""
-    faults = []
-    if not run.finished:
-        reasons = "; ".join(flaw.text for flaw in run.flaws)
-        faults.append(reasons if run.whole else f"{CUT} ({reasons})")
+    if run.finished or run.whole:
+        return _reasons(run)
+    return f"{CUT} ({_reasons(run)})"
+
+
+def _reasons(run: Run) -> str:
+    """Says what is wrong with a recording, and what ended its flight early."""
+    reasons = [] if run.finished else [flaw.text for flaw in run.flaws]
     if run.ended_by:
-        faults.append(plain_text(f"the flight ended early: {run.ended_by}"))
-    return "; ".join(faults)
+        reasons.append(plain_text(f"the flight ended early: {run.ended_by}"))
+    return "; ".join(reasons)
 
 
 def log(arguments: argparse.Namespace) -> Result:
@@ -126,7 +130,7 @@ def _read_steps(file: Path) -> Run:
     """Reads a recording that has steps."""
     run = read_run(file)
     if not len(run.times):
-        raise DataError(f"{file}: holds no step ({condition(run) or 'it is finished'})")
+        raise DataError(f"{file}: holds no step ({_reasons(run) or 'it is finished'})")
     return run
 
 

@@ -57,6 +57,8 @@ def _unknown_setting(match: re.Match[str], name: str) -> str:
 def _unknown_option(match: re.Match[str], name: str) -> str:
     option = match["option"]
     available = match["available"].split()
+    if not option:
+        return f"{match['group']}: choose one of {', '.join(available)}"
     return (
         f"{match['group']}: no such option {option!r}; "
         f"available are {', '.join(available)}{nearest(option, available)}"
@@ -81,7 +83,7 @@ _EXPLANATIONS: tuple[
     (re.compile(r"\ACould not override '(?P<setting>[^']+)'"), _unknown_setting),
     (
         re.compile(
-            r"Could not find '(?P<group>[^'/]+)/(?P<option>[^']+)'\s+"
+            r"Could not find '(?P<group>[^'/]+)/(?P<option>[^']*)'\s+"
             r"Available options in '[^']+':\n(?P<available>(?:\t.*\n)+)"
         ),
         _unknown_option,

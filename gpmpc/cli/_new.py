@@ -51,12 +51,14 @@ def _check_name(name: str) -> None:
     Of a file of settings gpmpc's own is found first, of a module the installed one.
     """
     is_word = name.isidentifier() and name.isascii() and not name.startswith("_")
-    if not is_word or keyword.iskeyword(name):
+    if not is_word:
         raise SettingError(
             "NAME", f"must be letters, digits and _, a letter first; got {name!r}"
         )
     owner = ""
-    if (config_folder() / "system" / f"{name}.yaml").exists():
+    if keyword.iskeyword(name):
+        owner = "a keyword of Python"
+    elif (config_folder() / "system" / f"{name}.yaml").exists():
         owner = "a system of gpmpc"
     elif name in _OTHER_MODULES:
         owner = "a file of the project"

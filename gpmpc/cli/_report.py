@@ -30,7 +30,7 @@ def report(arguments: argparse.Namespace) -> Result:
         document = report_document(runs, [*lines], folder)
         files = document.files("report") | {"report.html": document.html()}
         written = write_files(folder, files, "to")
-    console.print(terminal([terminal_table(runs)]))
+    console.print(terminal([terminal_table(runs, console.width)]))
     for kind, reasons in notes(runs).items():
         lines += [f"{kind.lower()}: {reason}" for reason in reasons]
     lines += [f"to fill: {command}" for command in runs.commands()]

@@ -42,7 +42,10 @@ def _check_weighed_states(controller: GPMPC) -> None:
 def _check_programs(controller: GPMPC) -> None:
     """Raises unless a step takes one program."""
     if controller.most_programs > 1:
-        rule = "an exported step takes one program; fly with iterations=1 first"
+        rule = (
+            "an exported step takes one program; fly with iterations=1 first, on the "
+            "command line controller.iterations=1"
+        )
         raise SettingError("iterations", f"{rule}; got {controller.iterations}")
 
 

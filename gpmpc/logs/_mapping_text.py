@@ -37,10 +37,20 @@ def load_mapping_text(path: str | Path) -> Any:
         yaml.YAMLError,
     ) as error:
         name = " ".join(str(path).split())
-        reason = " ".join(str(error).split())
+        reason = " ".join(_reason(error).split())
         raise SettingError(
             "mapping", f"{name:.200} cannot be read ({reason:.300})"
         ) from error
+
+
+def _reason(error: Exception) -> str:
+    """Returns why a file cannot be read, in the words that say it shortest."""
+    if isinstance(error, OSError):
+        return error.strerror or str(error)
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        place = error.problem_mark
+        return f"line {place.line + 1}, column {place.column + 1}: {error.problem}"
+    return str(error)
 
 
 class _UniqueKeys(yaml.SafeLoader):

@@ -18,7 +18,7 @@ from urllib.parse import quote
 
 import pandas as pd
 from rich import box
-from rich.console import Group, JustifyMethod
+from rich.console import Console, Group, JustifyMethod
 from rich.table import Table as TerminalTable
 from rich.text import Text
 
@@ -46,6 +46,7 @@ _LATEX = str.maketrans(
 )
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.IGNORECASE)
 _POWER = re.compile(r"(?<![\w.])(-?\d(?:\.\d+)?)e(-?\d+)(?![\w.])")
+_WIDEST = 10**6  # of a terminal that holds every table [characters]
 _FOLDED = 10  # lines that a page shows without being asked
 _STYLE = Path(__file__).with_name("document.css")
 
@@ -159,6 +160,12 @@ def terminal(tables: Sequence[Table], *notes: str) -> Group:
     """
     paragraphs = [Text(f"\n{note}") for note in notes]
     return Group(*(_terminal_table(table) for table in tables), *paragraphs)
+
+
+def least_width(table: Table) -> int:
+    """Returns how wide a terminal must be that breaks no word of a table."""
+    console = Console(width=_WIDEST)
+    return console.measure(_terminal_table(table)).minimum
 
 
 def json_text(content: Any) -> str:

@@ -47,7 +47,7 @@ def _flight(result: Result) -> str:
     along = ""
     if options["trajectory"] != "goal":
         along = f" along {options['trajectory']}"
-    steps = f"{result['steps']} steps"
+    steps = _steps(result["steps"])
     return f"{steps} of {options['system']}{along} with {options['controller']}"
 
 
@@ -96,7 +96,10 @@ def _judgement(result: Result) -> str:
     if judgement["level"] == "suspicious":
         return f"suspicious from step {judgement['step']} on: {judgement['reason']}"
     if judgement["suspicious"]:
-        return f"healthy at the end; {judgement['suspicious']} steps were suspicious"
+        were = "was" if judgement["suspicious"] == 1 else "were"
+        return (
+            f"healthy at the end; {_steps(judgement['suspicious'])} {were} suspicious"
+        )
     return "healthy"
 
 
@@ -164,11 +167,12 @@ def _suboptimal(result: Result) -> str:
 
 
 def _far_from_data(result: Result) -> str:
-    steps = result.get("far_from_data")
-    if not steps:
+    count = result.get("far_from_data")
+    if not count:
         return ""
+    plans = "the plan" if count == 1 else "the plans"
     return (
-        f"the plans of {steps} steps: there the model knows little more than its prior"
+        f"{plans} of {_steps(count)}: there the model knows little more than its prior"
     )
 
 
@@ -181,6 +185,10 @@ def _decision_times(result: Result) -> str:
     )
     median = f"median {1e3 * total['median']:.3g}"
     return f"{median}  ({stages}), 99 % below {1e3 * total['p99']:.3g}"
+
+
+def _steps(count: int) -> str:
+    return "1 step" if count == 1 else f"{count} steps"
 
 
 def _counts(statuses: Mapping[str, int]) -> str:

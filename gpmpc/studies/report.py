@@ -21,6 +21,7 @@ from gpmpc.studies._document import (
     MISSING,
     Document,
     Table,
+    least_width,
     plain_text,
     with_range,
 )
@@ -96,10 +97,15 @@ def report_document(
     )
 
 
-def terminal_table(report: Report) -> Table:
+def terminal_table(report: Report, width: int | None = None) -> Table:
     """Returns the table with short headers: median, and the quartiles below it.
 
-    What is zero everywhere is left out, and the end of a very long table.
+    What is zero everywhere is left out, and the end of a very long table. Where a
+    column a setting is more than the width holds, one column says what was typed.
+
+    Args:
+        report: All runs.
+        width: Of the terminal [characters]; by default as wide as the table is.
     """
     measures = [name for name in _measures_above_zero(report) if name in _SHORT_LABELS]
     header = [name.replace(".", ".\n") for name in _variables(report)]
@@ -110,7 +116,26 @@ def terminal_table(report: Report) -> Table:
     title = _counts(report)
     if len(rows) > _MOST_TERMINAL_ROWS:
         title += f"; the first {_MOST_TERMINAL_ROWS} of {len(rows)} cells"
-    return Table(header, rows[:_MOST_TERMINAL_ROWS], title)
+    table = Table(header, rows[:_MOST_TERMINAL_ROWS], title)
+    if width is None or least_width(table) <= width or not report.variables:
+        return table
+    return _with_typed_choices(report, table)
+
+
+def _with_typed_choices(report: Report, table: Table) -> Table:
+    """Returns a table with one column of what was typed, where each setting had one.
+
+    Of the settings the unit alone keeps its column.
+    """
+    typed = report.runs.groupby("cell").typed.first()
+    width = len(report.variables)
+    kept = [i for i, name in enumerate(report.variables) if name == UNIT]
+    rows = []
+    for cell, row in enumerate(table.rows):
+        choices = plain_text(" ".join(typed[cell])) or "none"
+        rows.append([choices, *(row[i] for i in kept), *row[width:]])
+    header = ["choices", *(table.header[i] for i in kept), *table.header[width:]]
+    return Table(header, rows, table.title)
 
 
 def notes(report: Report) -> dict[str, list[str]]:

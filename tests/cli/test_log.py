@@ -89,7 +89,7 @@ def test_recovering_a_recording_without_a_step_writes_no_file(folder, tmp_path):
     before = sorted(tmp_path.iterdir())
     reasons = {
         "spoiled.mcap": "no step of it can be read: 2 of 2 chunks cannot be read",
-        "early.mcap": "holds no step (unfinished or damaged",
+        "early.mcap": "holds no step (it was not finished: it has no end)\n",
     }
     for name, reason in reasons.items():
         result = gpmpc_log("recover", name, cwd=tmp_path)

@@ -3,7 +3,7 @@
 import pytest
 
 from gpmpc.studies.report import read_report, terminal_table
-from tests.studies.made_up import documents, made_up_run, metrics_of
+from tests.studies.made_up import documents, made_up_run, metrics_of, on_terminal
 
 SETTINGS = {
     "data": {"size": None},
@@ -30,6 +30,20 @@ def test_failed_solves_have_a_column_if_any_run_has_some(failing, tmp_path):
         assert "RMSE" in words
         assert "outside" not in words
     assert "outside" in documents(report)["report.csv"]  # which has room for everything
+
+
+def test_runs_that_differ_in_much_have_one_column_of_what_was_typed(tmp_path):
+    typed = [f"data.setting_{i}={i}" for i in range(12)]
+    for i in range(12):
+        values = {f"setting_{j}": j if i == j else 0.5 for j in range(12)}
+        made_up_run(
+            tmp_path, [typed[i]], SETTINGS | {"data": values}, result=metrics_of(0.1)
+        )
+    report = read_report(tmp_path)
+    assert len(terminal_table(report).header) > 12
+    shown = on_terminal(terminal_table(report, width=80), width=80).split()
+    assert sorted(word for word in shown if "setting" in word) == sorted(typed)
+    assert len(terminal_table(report, width=2000).header) > 12
 
 
 def test_a_comparison_stands_in_the_page_and_in_the_text(tmp_path):

@@ -97,6 +97,12 @@ def test_everything_that_a_result_may_hold_has_its_line():
     assert [name for name, _ in summary(unjudged).rows] == names
 
 
+def test_one_plan_far_from_the_data_is_one():
+    result = metrics_of(0.125) | {"far_from_data": 1}
+    lines = dict(summary(result | {"settings": {"options": OPTIONS}}).rows)
+    assert lines["far from the data"].startswith("the plan of 1 step: there")
+
+
 @pytest.mark.parametrize(
     ("judgement", "line"),
     [
@@ -104,6 +110,10 @@ def test_everything_that_a_result_may_hold_has_its_line():
         (
             FlightJudgement(suspicious=3),
             "healthy at the end; 3 steps were suspicious",
+        ),
+        (
+            FlightJudgement(suspicious=1),
+            "healthy at the end; 1 step was suspicious",
         ),
         (
             FlightJudgement("suspicious", "why", 5, 15),
