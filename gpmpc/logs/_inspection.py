@@ -59,6 +59,8 @@ from gpmpc.logs._time_step import JITTER
 from gpmpc.logs._units import TIME_UNITS
 
 EVEN = 1e-3  # of its step: a column that rises as evenly may be the time
+LARGEST_JITTER = 0.5  # of the median step of what may be times
+MOST_USUAL = 0.9  # least share of their steps that jitter no more
 DRAWN = 3000  # points of a channel's line
 MOST_DELAYS = 20  # that are listed
 FOLLOWS = 0.95  # share of an input's variance that the states explain
@@ -564,8 +566,15 @@ def _time_hints(
         return hints
     for name in numbers:
         steps = np.diff(source.table[name].to_numpy(float))
-        if len(steps) > 1 and steps[0] > 0 and np.ptp(steps) < EVEN * steps[0]:
-            hints.append(f"{name} rises evenly, by {steps[0]:.4g}: is it the time?")
+        if len(steps) < 2 or not steps.min() > 0:
+            continue
+        usual = float(np.median(steps))
+        is_usual = np.abs(steps - usual) < usual * LARGEST_JITTER
+        if np.ptp(steps) < EVEN * usual:
+            hints.append(f"{name} rises evenly, by {usual:.4g}: is it the time?")
+        elif is_usual.mean() >= MOST_USUAL:
+            text = f"{name} rises in every row, by about {usual:.4g}: is it the time?"
+            hints.append(text)
     return hints
 
 

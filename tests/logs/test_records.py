@@ -204,6 +204,14 @@ def test_columns_by_number_are_called_as_their_signals(tmp_path):
     mapping["states"] = {"both": [3, 1]}
     assert read_log(path, mapping).space.names == ("both_1", "both_2")
     assert "1 rises evenly, by 1: is it the time?" in inspect_log(path).warnings
+    # A clock whose rows jitter, and pause once.
+    jitter = np.random.default_rng(0).integers(-2, 3, ROWS)
+    clock = 10 * np.arange(ROWS) + jitter + 100 * (np.arange(ROWS) > 30)
+    jittering = record().assign(tempo=clock, way=np.cumsum(np.arange(ROWS) ** 2 + 1))
+    jittering.to_csv(tmp_path / "jittering.csv", index=False)
+    warnings = inspect_log(tmp_path / "jittering.csv").warnings
+    assert "tempo rises in every row, by about 10: is it the time?" in warnings
+    assert not any("way rises" in warning for warning in warnings)
     (tmp_path / "named.csv").write_text(record().to_csv(index=False))
     by_number = read_log(tmp_path / "named.csv", mapping_of(u=1, y=2))
     np.testing.assert_array_equal(by_number.runs[0].states[:, 0], record()["y"])
