@@ -38,6 +38,10 @@ _LINEARIZED_WITH_MEMORY = 120  # likewise of models with many entries to carry o
 _STRIDE_WITH_MEMORY = 8  # of the windows that are linearised of these
 _DIFFERENCE_OF_OUTPUTS = 1e-4  # of their ranges: in them a step is linear
 _LARGEST_CLAIM = 9.0  # of the mean squared error: the variance claimed at most
+_STRETCHES = 16  # of the held-out rows, one after the other,
+_RARE_STRETCHES = 2  # of which so many may err more than any other, and then count
+_RAREST_ERROR = 3.0  # times the mean squared error of the next one at most
+_WINDOWS_PER_STRETCH = 4  # at least
 _LEAST_FREEDOM = 4.0  # independent errors that a variance is supposed to be of
 _CUTS = 8  # rounds in which what is cut off is made up for
 _SMALLEST_VARIANCE = 1e-300  # that anything is divided by
@@ -223,7 +227,7 @@ def fit_noise(
         )
         for model, log in zip(models, logs, strict=True)
     ]
-    squared = np.concatenate([fold.squared for fold in folds]).mean(axis=0)
+    squared = _usual_mean(np.concatenate([fold.squared for fold in folds]))
     by_window = np.concatenate([fold.responses for fold in folds])
     responses = by_window.mean(axis=0)
     residuals = np.concatenate([fold.squared_residuals for fold in folds]).mean(axis=0)
@@ -337,6 +341,25 @@ def _mean_of_finite(squared: Sequence[Array]) -> Array:
     number = converged.sum(axis=0)
     total = np.where(converged, errors, 0.0).sum(axis=0)
     return np.where(number > 0, total / np.maximum(number, 1), np.inf)
+
+
+def _usual_mean(squared: Array) -> Array:
+    """Averages squared errors (W, steps, e), whatever happened once or twice.
+
+    A vehicle whose heading comes from its movement has none before it starts. An
+    interval as wide as such an error would be too wide ever after.
+
+    Args:
+        squared: Of windows, those of a run one after the other.
+    """
+    stretches = min(_STRETCHES, len(squared) // _WINDOWS_PER_STRETCH)
+    if stretches <= 2 * _RARE_STRETCHES:
+        return squared.mean(axis=0)
+    parts = np.array_split(squared, stretches)
+    means = np.array([part.mean(axis=0) for part in parts])
+    next_mean = np.sort(means, axis=0)[-1 - _RARE_STRETCHES]
+    means = np.where(next_mean > 0, np.minimum(means, _RAREST_ERROR * next_mean), means)
+    return np.average(means, axis=0, weights=[len(part) for part in parts])
 
 
 def _nonnegative_solution(regressors: Array, targets: Array) -> Array:

@@ -28,6 +28,7 @@ from gpmpc.logs._learning import _plan_folds
 from gpmpc.logs._log import LogRun
 from gpmpc.logs._noise import (
     _nonnegative_solution,
+    error_variances,
     fit_noise,
     learning_gains,
     noise_steps,
@@ -621,6 +622,21 @@ def test_noise_is_known_as_far_as_rollouts_reach():
     assert noise.steps[-4:] == (50, 70, 100, 120)
     largest = noise.largest_at((50, 120))
     assert (largest[1] > 1.5 * largest[0]).all()
+
+
+def test_noise_is_not_that_of_one_wild_stretch():
+    rng = np.random.default_rng(0)
+    walk = np.cumsum(rng.normal(size=(2, 2000, 2)), axis=1)
+    walk[0, 100:120, 0] += 100 * rng.normal(size=20)
+    log = log_of(walk, np.zeros((2, 2000, 1)))
+    kinematics = Increments(log.space)
+    still = AffineNominal(kinematics, fitted=False)
+    model = LogModel(kinematics, still, np.empty(0), history=(0, 0))
+    noise = fit_noise([model], [log], noise_steps(50))
+    variances = error_variances(model, log.windows(50, past=1), noise, (1, 10, 50))
+    ratios = variances.mean(axis=0) / np.array([[1.0], [10.0], [50.0]])
+    assert (ratios > 0.7).all()
+    assert (ratios < 1.6).all()
 
 
 def test_noise_is_fitted_to_what_is_finite():
