@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gpmpc._angles import state_difference
-from gpmpc._dynamics import linearize
+from gpmpc._dynamics import Linearized, linearize
 from gpmpc.models import DelayedModel
 from gpmpc.models._past import has_past
 from gpmpc.models._wrapper import Wrapper
@@ -153,6 +153,8 @@ class _RestSearch:
         self._target = target
         self._step = step
         self._target_input = target_input
+        # of states and inputs (n + m,), in which weights and prices are compared
+        self._units = np.ones(len(target) + len(target_input))
 
     def find(self) -> RestPoint | None:
         """Returns the point, by Gauss-Newton steps from the target on.
@@ -168,8 +170,13 @@ class _RestSearch:
         pending = pending_inputs(prediction.model)
         state[pending] = np.tile(input, len(pending) // len(input))
         start = np.concatenate([state, input])
+        ranges = self._ranges(state, input)
+        # An input that is locked, or a state that moves none, has no range.
+        has_range = np.isfinite(ranges) & (ranges > 0.0)
+        self._units = np.where(has_range, ranges, 1.0)
+        # states and inputs near zero have a size all the same
+        least_sizes = np.minimum(1.0, ranges)
         current = self._at(state, input)
-        least_sizes = self._least_sizes(current)
         sizes = least_sizes
         for _ in range(_ITERATIONS):
             if not math.isfinite(current.value):
@@ -208,35 +215,42 @@ class _RestSearch:
         has_range = np.isfinite(scales.ranges)
         return np.where(has_range, np.maximum(sizes, scales.ranges), sizes)
 
-    def _least_sizes(self, start: _Unrest) -> Array:
-        """Returns sizes (n + m,) that states and inputs near zero have all the same.
+    def _ranges(self, state: Array, input: Array) -> Array:
+        """Returns the ranges (n + m,) of states and inputs.
 
-        They are 1, or what is less of their ranges: of a state in the model's data, or
-        as far as the inputs move it within a horizon, or it a state that they move; of
-        an input between its bounds.
+        Of a state it is that in the model's data; without any, as far as the inputs
+        move it within a horizon, or it a state that they move, 1 at most. Of an input
+        it is that between its bounds.
         """
         prediction = self._prediction
         lower, upper = prediction.problem.inputs.first
         input_ranges = upper - lower
         if np.isfinite(input_ranges).all():
-            reachable = _reachable_ranges(
-                start.A, start.B, input_ranges, prediction.horizon
-            )
-            state_ranges = _ranges_by_effect(start.A, reachable, prediction.horizon)
+            H = prediction.horizon
+            start = self._linearize(state, input)
+            A = start.A[0]
+            reachable = _reachable_ranges(A, start.B[0], input_ranges, H)
+            state_ranges = _ranges_by_effect(A, reachable, H)
         else:
-            state_ranges = np.ones(len(start.A))
+            state_ranges = np.ones(len(state))
         scales = data_scales(prediction.model)
         if scales is not None:
             has_range = np.isfinite(scales.ranges)
             state_ranges = np.where(has_range, scales.ranges, state_ranges)
-        return np.minimum(1.0, np.concatenate([state_ranges, input_ranges]))
+        return np.concatenate([state_ranges, input_ranges])
+
+    def _linearize(self, state: Array, input: Array) -> Linearized:
+        """Returns the model at a state (n,) and an input (m,)."""
+        return linearize(
+            self._prediction.model, state[None], input[None], covariance=False
+        )
 
     def _at(self, state: Array, input: Array) -> _Unrest:
         """Returns cost and defect at a state (n,) and an input (m,)."""
         prediction = self._prediction
         n = len(state)
         m = len(input)
-        model = linearize(prediction.model, state[None], input[None], covariance=False)
+        model = self._linearize(state, input)
         A = model.A[0]
         B = model.B[0]
         move = state_difference(model.mean[:1], state[None], prediction.angles)[0]
@@ -256,13 +270,17 @@ class _RestSearch:
             hessian = hessian + cost.squares[0, :-1, :-1]
             gradient = gradient + (cost.squares[0] @ z)[:-1]
             value = value + z @ cost.squares[0] @ z
-        largest = np.abs(hessian).max() or 1.0
+        # Weights and prices are compared in the units of ``_units``, not in the user's.
+        units = self._units
+        largest = np.abs(hessian * np.outer(units, units)).max() or 1.0
         rows = np.hstack([A - np.eye(n), B])
-        price = _PRICE * largest
-        hessian = hessian + _NEGLIGIBLE * largest * np.eye(n + m)
-        hessian = hessian + price * rows.T @ rows
-        gradient = gradient + price * rows.T @ defect
-        value = float(value + price * defect @ defect)
+        prices = _PRICE * largest / units[:n] ** 2
+        damped_units = units.copy()
+        damped_units[n:] = units[n:].max()  # inputs share what several can hold
+        hessian = hessian + np.diag(_NEGLIGIBLE * largest / damped_units**2)
+        hessian = hessian + (rows.T * prices) @ rows
+        gradient = gradient + rows.T @ (prices * defect)
+        value = float(value + prices @ defect**2)
         if not (np.isfinite(hessian).all() and np.isfinite(gradient).all()):
             value = math.inf
         return _Unrest(

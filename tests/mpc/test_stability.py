@@ -378,6 +378,25 @@ def test_what_moves_on_is_no_rest_in_any_unit(micrometre, creep):
     assert controller.stability(np.zeros(2)).judged == (creep == 0.0)
 
 
+@pytest.mark.parametrize("micrometre", [1e-6, 1.0, 1e6])
+def test_a_loop_rests_at_its_goal_in_any_unit(micrometre):
+    """A stage on a spring that hardens, 0.8 micrometres from where it is slack."""
+
+    def next_state(x, u):
+        place, speed = x.unbind(-1)
+        spring = 40.0 * place + 2.0 * place**3 / micrometre**2
+        force = 2.0 * micrometre * u[..., 0] - spring - 4.0 * speed
+        return torch.stack([place + 0.05 * speed, speed + 0.05 * force], dim=-1)
+
+    cost = Tracking([1.0 / micrometre**2, 1e-3 / micrometre**2], [1e-4])
+    model = KnownModel(next_state, 2, 1)
+    controller = loop_of(model, cost, 25, [0.0], bounds=Box([-30.0], [30.0]))
+    known = controller.stability([0.8 * micrometre, 0.0])
+    assert known.states[0] / micrometre == pytest.approx([0.8, 0.0], abs=1e-3)
+    assert known.inputs[0] == pytest.approx([16.512], abs=1e-2)
+    assert known.spectral_radius == pytest.approx(0.6425, abs=1e-3)
+
+
 @pytest.mark.parametrize("penalized", ["increments", "inputs"])
 def test_a_locked_input_is_held_and_the_loop_is_judged(penalized):
     cost = Tracking([1.0], [0.1], penalized=penalized)
