@@ -1,11 +1,13 @@
 """The animation of a flight shows what it draws."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+import pytest
+from matplotlib.animation import PillowWriter
 
-from gpmpc.plotting._animation import draw_flight
-from gpmpc.plotting._style import PLAN
+from gpmpc.plotting import animate
 from gpmpc.recording import read_run
 from tests.recording.runs import record_run
 
@@ -35,23 +37,56 @@ def flight(folder, failed=()):
     )
 
 
-def left_views(run):
-    """Yields the limits of the view from above, and the plan drawn there, by step."""
-    picture = draw_flight(run)
-    above = picture.figure.axes[0]
-    (plan,) = [line for line in above.lines if line.get_color() == PLAN]
-    for k in range(STEPS):
-        picture.draw(k)
-        yield above.get_xlim(), above.get_ylim(), plan.get_xdata(), plan.get_ydata()
+@pytest.fixture
+def frames_of(tmp_path, monkeypatch):
+    """What ``animate`` draws: limits of the left view, and its lines, step by step."""
+    frames = []
+
+    def look(writer, **settings):
+        above, height = writer.fig.axes[:2]
+        lines = [
+            [np.array(line.get_xydata()) for line in a.lines] for a in (above, height)
+        ]
+        frames.append((above.get_xlim(), above.get_ylim(), *lines))
+
+    def finish(writer):
+        Path(writer.outfile).write_bytes(b"no picture")
+
+    monkeypatch.setattr(PillowWriter, "grab_frame", look)
+    monkeypatch.setattr(PillowWriter, "finish", finish)
+
+    def drawn(run):
+        animate(run, tmp_path / "flight.gif")
+        return frames
+
+    return drawn
 
 
-def test_every_plan_lies_in_the_left_view(tmp_path):
-    for (left, right), (low, high), x, y in left_views(flight(tmp_path)):
-        assert len(x) == HORIZON + 1
+def test_every_plan_lies_in_the_left_view(tmp_path, frames_of):
+    run = flight(tmp_path)
+    frames = frames_of(run)
+    assert len(frames) == STEPS
+    for plan, ((left, right), (low, high), above, _) in zip(
+        run.plan_means[:, :, [0, 2]], frames, strict=True
+    ):
+        assert any(np.array_equal(line, plan) for line in above)
+        x, y = plan.T
         assert left < x.min() <= x.max() < right
         assert low < y.min() <= y.max() < high
 
 
-def test_a_failed_solves_plan_does_not_shrink_the_flight(tmp_path):
-    for (left, right), *_ in left_views(flight(tmp_path, failed=[4])):
+def test_a_failed_solves_plan_does_not_shrink_the_flight(tmp_path, frames_of):
+    for (left, right), *_ in frames_of(flight(tmp_path, failed=[4])):
         assert right - left < 60  # [m], of a path of 36
+
+
+def test_no_path_is_drawn_across_lost_steps(tmp_path, frames_of):
+    run = flight(tmp_path)
+    rows = np.array([0, 1, 2, 3, 6, 7])
+    per_step = ("steps", "times", "references", "states", "inputs", "timings")
+    per_step += ("plan_means", "plan_covariances", "failed", "judgements")
+    parts = {name: getattr(run, name)[rows] for name in per_step}
+    *_, above, height = frames_of(replace(run, **parts))[-1]
+    for lines in (above, height):
+        flown = lines[1]
+        assert np.flatnonzero(np.isnan(flown).any(axis=1)).tolist() == [4]

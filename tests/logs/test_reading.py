@@ -6,17 +6,13 @@ from pathlib import Path
 import numpy as np
 import pandas
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
-from gpmpc._angles import wrap
 from gpmpc.exceptions import DataError, SettingError
 from gpmpc.logs import LogMapping, inspect_log, read_log
-from gpmpc.logs._judging import check_train
-from gpmpc.logs._runs import split_into_runs
-from gpmpc.logs._structures import _multirotor_base
-from gpmpc.models._parametric import MultirotorNominal
-from gpmpc.models._quaternions import rotate, rotation_quaternion
-from gpmpc.models._state_space import StateGroup, StateSpace
+from tests.cli.command import called
+from tests.logs.tables import split_into_runs
 
 PENDULUM = {
     "time": {"column": "t"},
@@ -41,6 +37,11 @@ BODY = {
     },
     "inputs": {"thrust": ["u"]},
 }
+
+
+def wrap(angle):
+    """The same angles between -pi and pi."""
+    return angle - 2 * np.pi * np.round(angle / (2 * np.pi))
 
 
 def pendulum_table(rows=400, seed=0):
@@ -363,21 +364,11 @@ def test_repeated_values_that_cut_a_log_are_named_with_a_way_out(tmp_path):
     position = table[["px", "py", "pz"]].round(2)
     position[1::10] = position[::10].to_numpy()  # of a coarse sensor
     table[["px", "py", "pz"]] = position
-    log = read_log(written(tmp_path, table), BODY)
-    with pytest.raises(DataError, match=r"keep values that repeat \(held: use\)$"):
-        check_train(log)
-
-
-@pytest.mark.parametrize(
-    ("unit", "thrusts"), [("mN", True), ("kN", True), ("V", False)]
-)
-def test_inputs_in_any_unit_of_force_are_thrusts(tmp_path, unit, thrusts):
-    table = body_table().assign(a=1, b=2, c=3)
-    motors = {"columns": ["u", "a", "b", "c"], "unit": unit}
-    log = read_log(written(tmp_path, table), {**BODY, "inputs": {"motors": motors}})
-    nominal = _multirotor_base(log, 0).model.nominal
-    assert isinstance(nominal, MultirotorNominal)
-    assert nominal.thrusts == thrusts
+    written(tmp_path, table)
+    (tmp_path / "log.yaml").write_text(yaml.safe_dump(BODY, sort_keys=False))
+    done = called("learn", "log.yaml", "log.csv", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.endswith("keep values that repeat (held: use)\n")
 
 
 def test_arrays_of_dates_of_bytes_and_side_by_side_are_read(tmp_path):
@@ -793,20 +784,19 @@ def test_a_px4_log_is_read(tmp_path):
 
 
 def test_state_differences_are_inverse_to_displacements():
-    space = StateSpace(
-        (
-            StateGroup("p", ("x", "y"), "m"),
-            StateGroup("a", ("a",), "rad", "angle"),
-            StateGroup("q", tuple("xyzw"), "", "quaternion"),
-        )
-    )
+    states = {
+        "p": {"columns": ["px", "py"], "unit": "m"},
+        "a": {"columns": ["a"], "unit": "rad", "kind": "angle"},
+        "q": {"columns": ["qx", "qy", "qz", "qw"], "kind": "quaternion"},
+    }
+    space = LogMapping.from_dict({**PENDULUM, "states": states}).space
     rng = np.random.default_rng(0)
     error = rng.uniform(-1.5, 1.5, (50, space.error_dim))
     state = np.hstack(
         [
             rng.normal(size=(50, 2)),
             rng.uniform(-3, 3, (50, 1)),
-            rotation_quaternion(rng.normal(size=(50, 3))),
+            Rotation.from_rotvec(rng.normal(size=(50, 3))).as_quat(),
         ]
     )
     displaced = space.displace(state, error)
@@ -816,8 +806,7 @@ def test_state_differences_are_inverse_to_displacements():
     np.testing.assert_allclose(
         space.distances(error)[:, 2], np.linalg.norm(error[:, 3:], axis=1)
     )
-    np.testing.assert_allclose(
-        rotate(rotation_quaternion(np.array([0, 0, np.pi / 2])), np.array([1.0, 0, 0])),
-        [0, 1, 0],
-        atol=1e-12,
-    )
+    upright = np.array([0.0, 0, 0, 0, 0, 0, 1])
+    turned = space.displace(upright, np.array([0, 0, 0, 0, 0, np.pi / 2]))
+    x_axis = Rotation.from_quat(turned[3:]).apply([1.0, 0, 0])
+    np.testing.assert_allclose(x_axis, [0, 1, 0], atol=1e-12)

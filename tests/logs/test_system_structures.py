@@ -24,6 +24,7 @@ from gpmpc.logs import (
     save_learned,
 )
 from gpmpc.logs._structures import bases
+from gpmpc.models import MultirotorNominal
 from gpmpc.models._actuators import FirstOrderLags
 from gpmpc.models._log_dynamics import OutputNoise
 from gpmpc.models._stored_log_model import (
@@ -46,6 +47,7 @@ from gpmpc.testing import check_model
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))
 from tests.cli.command import forked
+from tests.logs.test_reading import BODY, body_table, written
 
 ROOT = Path(__file__).resolve().parents[2]
 HEADING = {"columns": ["heading"], "kind": "angle", "unit": "rad"}
@@ -649,3 +651,15 @@ def test_what_is_derived_of_parameters_follows_them(fitted):
     together = nominal.outputs(several, states, inputs, None)
     alone = nominal.outputs(theta, states, inputs, None)
     np.testing.assert_allclose(together[1], alone[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("unit", "thrusts"), [("mN", True), ("kN", True), ("V", False)]
+)
+def test_inputs_in_any_unit_of_force_are_thrusts(tmp_path, unit, thrusts):
+    table = body_table().assign(a=1, b=2, c=3)
+    motors = {"columns": ["u", "a", "b", "c"], "unit": unit}
+    log = read_log(written(tmp_path, table), {**BODY, "inputs": {"motors": motors}})
+    nominal = bases(log, 40)[0].model.nominal
+    assert isinstance(nominal, MultirotorNominal)
+    assert nominal.thrusts == thrusts

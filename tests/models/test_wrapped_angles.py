@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from gpmpc._angles import full_turns, state_difference, wrap
 from gpmpc.calibration import Recording, calibrate
 from gpmpc.estimation import (
     AdaptiveTube,
@@ -22,16 +21,15 @@ from gpmpc.models import (
     CasadiFunction,
     DelayedModel,
     DisturbedModel,
-    Features,
     KnownModel,
     Lags,
     NoisyModel,
     ResidualModel,
     RollOut,
+    train,
 )
-from gpmpc.models._kinematic_rates import kinematic_residual
-from gpmpc.models._residual import train_residual
 from gpmpc.propagation import Linearization, MonteCarlo, Unscented
+from gpmpc.systems import System
 
 STEP = 0.05
 F = torch.float64
@@ -72,8 +70,13 @@ def transitions(kind, sensor=shown):
     return Transitions(seen[:-1], inputs, seen[1:])
 
 
-def learned(data, nominal=None):
-    return train_residual(EXACT, data, angles=[0], nominal=nominal).posterior
+def wrap(angle):
+    """The same angles between -pi and pi."""
+    return angle - 2 * np.pi * (angle / (2 * np.pi)).round()
+
+
+def learned(data, nominal=IDENTITY):
+    return ResidualModel.train(nominal, data, angles=[0], trainer=EXACT)
 
 
 HANGING = learned(transitions("hanging"))
@@ -212,6 +215,25 @@ def test_a_function_wraps_where_it_has_a_value():
     assert counting.counting_turns((0,)) is not counting
 
 
+class Turning:
+    state_names = ("angle", "rate")
+    input_names = ("torque",)
+
+    def derivative(self, x, u):
+        return [x[1], u[0]]
+
+
+def turning(time_step):
+    return System(
+        Turning(),
+        time_step,
+        input_lower=[-1.0],
+        input_upper=[1.0],
+        angles=("angle",),
+        rates={"rate": "angle"},
+    )
+
+
 def test_a_position_may_turn_by_half_a_turn_in_a_step():
     rng = np.random.default_rng(0)
     h = 0.1
@@ -219,18 +241,11 @@ def test_a_position_may_turn_by_half_a_turn_in_a_step():
     inputs = rng.uniform(-1, 1, (60, 1))
     rate = states[:, 1] + inputs[:, 0]
     after = np.column_stack([states[:, 0] + h * rate, rate])  # half a turn and more
-    tensors = [torch.from_numpy(rows) for rows in (states, inputs, shown(after))]
-    kinematic = kinematic_residual(
-        rates={1: 0},
-        features=Features([0, 1], [0], [0], state_dim=2, input_dim=1),
-        nominal=None,
-        states=tensors[0],
-        inputs=tensors[1],
-        next_states=tensors[2],
-        time_step=h,
-    )
-    assert float(kinematic.noise[0]) < 1e-12
-    assert kinematic.B.ravel().tolist() == pytest.approx([h, 1.0])
+    data = Transitions(states, inputs, shown(after))
+    model = train(data, system=turning(h), restarts=0).posterior
+    of_gps = model.B.square() @ model.residual.noise_variance
+    assert float(model.noise_covariance[0, 0] - of_gps[0]) < 1e-12
+    assert model.B.ravel().tolist() == pytest.approx([h, 1.0])
 
 
 def test_a_noise_that_varies_is_the_same_a_turn_on():
@@ -318,7 +333,7 @@ def test_wrappers_and_lags_know_the_angles_of_their_model():
 @pytest.mark.parametrize(
     "train",
     [
-        lambda data: train_residual(EXACT, data),
+        lambda data: ResidualModel.train(IDENTITY, data, trainer=EXACT),
         lambda data: EXACT(data),
         lambda data: Trainer(predicts="difference", restarts=0)(data),
         lambda data: EXACT.refit(
@@ -341,15 +356,26 @@ def test_training_names_an_undeclared_angle_once(train, caplog):
     assert "angles=[0]" in warnings[0]
 
 
-def warned(states, next_states, caplog, angles=()):
-    from gpmpc.gp._wrapped import warn_of_turns
+class WouldTrain(Exception):
+    """All that is said before a training was said."""
 
+
+class NoTrainer:
+    """Looks at the data, and learns nothing."""
+
+    def fit(self, **data):
+        raise WouldTrain
+
+
+def warned(states, next_states, caplog, angles=()):
+    """What is said of whole turns before a training."""
     data = Transitions(states, np.zeros((len(states), 1)), next_states)
-    with caplog.at_level(logging.WARNING, "gpmpc"):
-        warn_of_turns(data, angles)
-    text = caplog.text
+    nominal = Affine.identity(states.shape[1], 1)
+    with caplog.at_level(logging.WARNING, "gpmpc"), pytest.raises(WouldTrain):
+        ResidualModel.train(nominal, data, angles=angles, trainer=NoTrainer())
+    messages = [record.getMessage() for record in caplog.records]
     caplog.clear()
-    return text
+    return "\n".join(message for message in messages if "whole turns" in message)
 
 
 def test_declared_angles_and_those_that_count_turns_are_no_news(caplog):
@@ -403,21 +429,6 @@ def test_honest_large_steps_are_no_turns(steps, caplog):
     for seed in range(5):
         x = np.cumsum(steps(np.random.default_rng(seed)))[:, None]
         assert warned(x[:-1], x[1:], caplog) == ""
-
-
-def test_differences_of_states_leave_whole_turns_out():
-    one = np.array([[3.1, 5.0], [-9.0, 0.0]])
-    other = np.array([[-3.1, -5.0]])
-    for kind in (np.array, torch.tensor):
-        difference = state_difference(kind(one), kind(other), [0])
-        assert np.allclose(
-            difference, [[6.2 - 2 * np.pi, 10.0], [-5.9 + 2 * np.pi, 5.0]]
-        )
-    assert np.array_equal(state_difference(one, other, []), one - other)
-    assert np.allclose(full_turns(one - other, [0]), [[2 * np.pi, 0], [-2 * np.pi, 0]])
-    small = np.array([1e-17, -1e-9, 3.14, -3.14, np.pi, -np.pi])
-    assert np.array_equal(wrap(small), small)
-    assert np.isnan(wrap(np.array([np.nan]))).all()
 
 
 def test_a_calibration_counts_no_turn_as_an_error():

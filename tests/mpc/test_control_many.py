@@ -7,7 +7,6 @@ import torch
 from gpmpc.gaussian import Gaussian
 from gpmpc.gp import backend
 from gpmpc.mpc import GPMPC, Box, PredictionSettings, Problem, Reference, Tracking
-from gpmpc.mpc._linearization import StageLinearizer
 from gpmpc.propagation import Linearization, MeanEquivalence, MomentMatching, Unscented
 from gpmpc.status import Status
 from tests.mpc.small_models import FORMS
@@ -146,17 +145,13 @@ def test_each_question_may_take_its_own_number_of_programs():
 )
 def test_stages_stay_on_the_device_of_the_model(covariance, propagator):
     (belief,) = beliefs(1)
-    linearizer = StageLinearizer(GP, propagator, covariance)
-    covariances = np.repeat(belief.covariance.numpy()[None], 2, axis=0)
-    states = linearizer.state(
-        np.repeat(belief.mean.numpy()[None], 2, axis=0), covariances
-    )
-    with (
-        torch.device("meta"),
-        backend("torch"),
-    ):  # a tensor made without saying where lands there, and is noticed
-        stages = linearizer(states, np.ones((2, 3)), covariances)
-    assert all(np.isfinite(part).all() for part in stages)
+    mpc = controller("trajectory", covariance, propagator)
+    # a tensor made without saying where lands there, and is noticed
+    with torch.device("meta"), backend("torch"):
+        decision = mpc.control(belief, REFERENCE)
+    assert decision.status.solved
+    assert np.isfinite(decision.covariances).all()
+    assert np.isfinite(decision.means).all()
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")

@@ -92,3 +92,10 @@ def solve_stacked(P, q, G, lower, upper, warm_start=None, prices=None):
     return DualActiveSet().solve(
         QuadraticProgram.unchecked(P, q, G, lower, upper), warm_start, prices
     )
+
+
+def start_of_x(solution):
+    """Where x, which is a view of a solution's record, begins in it."""
+    record_address = solution.record.__array_interface__["data"][0]
+    x_address = solution.x.__array_interface__["data"][0]
+    return (x_address - record_address) // solution.record.itemsize

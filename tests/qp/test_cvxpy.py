@@ -2,12 +2,12 @@ import subprocess
 import sys
 from time import sleep
 
+import cvxpy
 import numpy as np
 import pytest
 
 from gpmpc.exceptions import ProblemError
 from gpmpc.qp import CvxpySolver, DualActiveSet, QuadraticProgram
-from gpmpc.qp._cvxpy import _compile
 from gpmpc.status import Status
 from tests.qp.problems import distance, feasible_problem
 
@@ -47,26 +47,48 @@ def test_solvers_of_cvxpy_find_our_minimiser_and_multipliers(name, rng):
         np.testing.assert_allclose(theirs.multipliers, ours.multipliers, atol=1e-4)
 
 
-def test_a_problem_of_the_same_shape_is_not_compiled_again(rng):
+@pytest.fixture
+def compiled(monkeypatch):
+    """The problems that are compiled from now on."""
+    make = cvxpy.Problem
+    problems = []
+
+    def watched(*arguments):
+        problems.append(make(*arguments))
+        return problems[-1]
+
+    monkeypatch.setattr(cvxpy, "Problem", watched)
+    return problems
+
+
+def test_a_problem_of_the_same_shape_is_not_compiled_again(rng, compiled):
     solver = CvxpySolver()
-    _compile.cache_clear()
-    first = solver.solve(feasible_problem(rng, 8, 10))
-    second_problem = feasible_problem(rng, 8, 10)
+    first = solver.solve(feasible_problem(rng, 7, 11))
+    second_problem = feasible_problem(rng, 7, 11)
     second = solver.solve(second_problem, first)
     assert second.is_optimal(1e-6)
-    assert _compile.cache_info().misses == 1
+    assert len(compiled) <= 1
     np.testing.assert_allclose(
         second.x, DualActiveSet().solve(second_problem).x, atol=1e-6
     )
 
 
-def test_the_store_of_compiled_problems_stays_small():
+def test_the_store_of_compiled_problems_stays_small(compiled):
     solver = CvxpySolver()
+
+    def solve(n):
+        problem = QuadraticProgram(np.eye(n), np.ones(n), lb=np.zeros(n))
+        assert solver.solve(problem).status.solved
+
     for n in range(1, 70):
-        assert solver.solve(
-            QuadraticProgram(np.eye(n), np.ones(n), lb=np.zeros(n))
-        ).status.solved
-    assert _compile.cache_info().currsize == 64
+        solve(n)
+    compiled.clear()
+    for n in range(69, 5, -1):  # the last 64
+        solve(n)
+    assert not compiled
+    for n in (1, 2):
+        solve(n)
+    assert len(compiled) == 2
 
 
 def test_an_answer_with_large_residuals_is_not_called_solved(rng):

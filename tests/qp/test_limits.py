@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
-from gpmpc.qp._record import ITERATION_LIMIT, STATUS
 from gpmpc.status import Status
 from tests.qp.problems import feasible_problem, integer_problem
 from tests.qp.test_near_dependence import near_dependent_problem
@@ -78,33 +77,6 @@ def test_all_tries_of_a_program_count_together():
         problem = near_dependent_problem(rng, feasible=False)
         solution = DualActiveSet(iteration_limit=6).solve(problem)
         assert solution.iterations <= 6 + len(problem.q)  # as many enter at once
-
-
-def test_a_limit_met_in_the_second_try_is_the_end(monkeypatch):
-    def rescue(problem, caps, record, limit, late):
-        assert record[STATUS] != ITERATION_LIMIT
-        ends.append(int(record[STATUS]))
-        return record
-
-    monkeypatch.setattr("gpmpc.qp._dual_active_set.rescue", rescue)
-    rng = np.random.default_rng(0)
-    ends = []
-    for _ in range(400):
-        problem = near_dependent_problem(rng, feasible=False)
-        for limit in (3, 6):
-            DualActiveSet(iteration_limit=limit).solve(problem)
-    assert ends
-
-
-@pytest.mark.parametrize("seed", [175, 353, 361])
-def test_a_second_try_goes_on_after_a_look_at_the_clock(seed, monkeypatch):
-    def rescue(problem, caps, record, limit, late):
-        assert record[STATUS] != ITERATION_LIMIT
-        return record
-
-    monkeypatch.setattr("gpmpc.qp._dual_active_set.rescue", rescue)
-    problem = near_dependent_problem(np.random.default_rng(seed), feasible=False)
-    DualActiveSet(time_limit=60.0).solve(problem)
 
 
 def test_a_tolerance_near_rounding_needs_no_doubled_digits(rng, monkeypatch):

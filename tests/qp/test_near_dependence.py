@@ -14,10 +14,12 @@ from gpmpc.qp._dual_rescue import _add as add_to_pair
 from gpmpc.qp._record import (
     HEADER,
     INFEASIBLE,
+    ITERATION_LIMIT,
     SOLVED,
     STATUS,
     warm_record,
 )
+from gpmpc.qp._solution import proves_infeasibility
 from gpmpc.status import Status
 from tests.qp.problems import feasible_problem
 
@@ -150,3 +152,63 @@ def test_a_sum_of_two_floats_keeps_what_the_first_rounds_off(where):
         exact = sum(Fraction(float(term)) for term in terms)
         assert high == Fraction(float(high + low))  # the second is its rounding
         assert abs(high + low - exact) <= abs(exact) * Fraction(2) ** -100
+
+
+def test_a_limit_met_in_the_second_try_is_the_end(monkeypatch):
+    def rescue(problem, caps, record, limit, late):
+        assert record[STATUS] != ITERATION_LIMIT
+        ends.append(int(record[STATUS]))
+        return record
+
+    monkeypatch.setattr("gpmpc.qp._dual_active_set.rescue", rescue)
+    rng = np.random.default_rng(0)
+    ends = []
+    for _ in range(400):
+        problem = near_dependent_problem(rng, feasible=False)
+        for limit in (3, 6):
+            DualActiveSet(iteration_limit=limit).solve(problem)
+    assert ends
+
+
+@pytest.mark.parametrize("seed", [175, 353, 361])
+def test_a_second_try_goes_on_after_a_look_at_the_clock(seed, monkeypatch):
+    def rescue(problem, caps, record, limit, late):
+        assert record[STATUS] != ITERATION_LIMIT
+        return record
+
+    monkeypatch.setattr("gpmpc.qp._dual_active_set.rescue", rescue)
+    problem = near_dependent_problem(np.random.default_rng(seed), feasible=False)
+    DualActiveSet(time_limit=60.0).solve(problem)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+def test_a_ray_proves_what_it_contradicts_and_nothing_else(scale):
+    """x + y <= 1 and x + y >= 2: the sum with weights 1 and -1 is 0 <= -1."""
+    G = np.ones((2, 2))
+    wide = np.full(2, np.inf)
+    lower = np.append(-wide, [-np.inf, 2.0])
+    upper = np.append(wide, [1.0, np.inf])
+
+    def proves(ray, low=lower, high=upper):
+        return proves_infeasibility(scale * np.array(ray), G, low, high)
+
+    assert proves([0, 0, 1, -1])
+    of_priced_row = (scale * np.array([0, 0, 1, -1]), G, lower, upper)
+    assert not proves_infeasibility(*of_priced_row, caps=np.append(wide, [0.5, 9.0]))
+    assert not proves([0, 0, -1, 1])  # of bounds that are absent
+    assert not proves([0, 0, 1, -0.5])  # what is left moves a variable without bound
+    assert not proves([0, 0, 0, 0])
+    assert not proves([0, 0, np.nan, 0])
+    assert not proves([0, 0, 1, -1], high=np.append(wide, [2.0, np.inf]))  # they touch
+    boxed = (
+        np.append(-np.full(2, 0.1), [-np.inf, 2.0]),
+        np.append(np.full(2, 0.1), [1.0, np.inf]),
+    )
+    assert proves([0, 0, 0, -1], *boxed)  # the box carries what is left: x + y <= 0.2
+    assert proves([1, 1, 0, -1], *boxed)
+    assert not proves([0, 0, 1, 0], *boxed)
+    assert (
+        not DualActiveSet()
+        .solve(QuadraticProgram.from_stacked(np.eye(2), np.zeros(2), G, *boxed))
+        .status.solved
+    )

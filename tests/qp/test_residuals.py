@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from gpmpc.qp import DualActiveSet, QuadraticProgram, make_solution
-from gpmpc.qp._solution import proves_infeasibility
+from gpmpc.qp import QuadraticProgram, make_solution
 from gpmpc.status import Status
 
 ABSENT = 1e20
@@ -163,34 +162,3 @@ def test_a_solution_from_parts_holds_each_of_them(rng):
     assert (bare.iterations, bare.build_seconds, bare.solve_seconds) == (0, 0.0, 0.0)
     assert not bare.active_set.any()
     assert not bare.is_optimal()
-
-
-@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
-def test_a_ray_proves_what_it_contradicts_and_nothing_else(scale):
-    """x + y <= 1 and x + y >= 2: the sum with weights 1 and -1 is 0 <= -1."""
-    G = np.ones((2, 2))
-    wide = np.full(2, np.inf)
-    lower = np.append(-wide, [-np.inf, 2.0])
-    upper = np.append(wide, [1.0, np.inf])
-
-    def proves(ray, low=lower, high=upper):
-        return proves_infeasibility(scale * np.array(ray), G, low, high)
-
-    assert proves([0, 0, 1, -1])
-    assert not proves([0, 0, -1, 1])  # of bounds that are absent
-    assert not proves([0, 0, 1, -0.5])  # what is left moves a variable without bound
-    assert not proves([0, 0, 0, 0])
-    assert not proves([0, 0, np.nan, 0])
-    assert not proves([0, 0, 1, -1], high=np.append(wide, [2.0, np.inf]))  # they touch
-    boxed = (
-        np.append(-np.full(2, 0.1), [-np.inf, 2.0]),
-        np.append(np.full(2, 0.1), [1.0, np.inf]),
-    )
-    assert proves([0, 0, 0, -1], *boxed)  # the box carries what is left: x + y <= 0.2
-    assert proves([1, 1, 0, -1], *boxed)
-    assert not proves([0, 0, 1, 0], *boxed)
-    assert (
-        not DualActiveSet()
-        .solve(QuadraticProgram.from_stacked(np.eye(2), np.zeros(2), G, *boxed))
-        .status.solved
-    )

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from gpmpc.qp import DualActiveSet, PrimalActiveSet, QuadraticProgram
-from gpmpc.qp._record import HEADER
 from gpmpc.status import Status
-from tests.qp.problems import feasible_problem, worst_residual
+from tests.qp.problems import feasible_problem, start_of_x, worst_residual
 
 
 def prepared(problem, prices, warm_start=None):
@@ -161,7 +160,7 @@ def test_a_record_that_was_cut_off_is_not_read_beyond_its_end(solve, rng):
     problem = conflicting_problem(rng, 4, 12)
     cold = solve(problem, np.full(12, 0.1))
     assert (np.abs(cold.z) == 0.1).any()
-    cut_off = cold._replace(record=cold.record[: HEADER + 4])
+    cut_off = cold._replace(record=cold.record[: start_of_x(cold) + 4])
     again = solve(problem, np.full(12, 0.1), cut_off)
     assert again.iterations == cold.iterations
 

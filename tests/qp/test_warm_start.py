@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from gpmpc.qp import DualActiveSet
-from gpmpc.qp import _record as layout
 from gpmpc.status import Status
 from tests.qp.problems import (
     changing,
@@ -16,6 +15,7 @@ from tests.qp.problems import (
     prepared,
     primal,
     solve_stacked,
+    start_of_x,
     worst_residual,
 )
 
@@ -61,11 +61,12 @@ def test_a_record_full_of_nonsense_is_a_harmless_warm_start(solve, rng):
     problem = feasible_problem(rng, 6, 8)
     cold = solve(problem)
     for filling in (np.nan, np.inf, -np.inf, 1e300, -7.5, 0.0, 3.0):
-        record = np.full_like(cold.record, filling)
         for count in (0.0, 3.0, 14.0, np.nan, -1.0, 1e9):
-            record[layout.WORKING] = count
-            nonsense = cold._replace(record=record)
-            np.testing.assert_allclose(solve(problem, nonsense).x, cold.x, atol=1e-10)
+            for position in range(start_of_x(cold)):
+                record = np.full_like(cold.record, filling)
+                record[position] = count
+                again = solve(problem, cold._replace(record=record))
+                np.testing.assert_allclose(again.x, cold.x, atol=1e-10)
 
 
 @ALL
