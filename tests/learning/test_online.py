@@ -19,6 +19,7 @@ from gpmpc.learning import (
 )
 from gpmpc.learning._continuations import continuations, forecast
 from gpmpc.learning._innovation import LearningStep
+from gpmpc.learning._step import _noise_variance
 from gpmpc.models import Affine, ResidualModel
 from gpmpc.mpc import (
     GPMPC,
@@ -376,3 +377,33 @@ def test_a_single_precision_model_is_changed_as_well():
     assert torch.allclose(belief.mean.double(), expected.mean, atol=1e-3)
     assert torch.allclose(belief.covariance.double(), expected.covariance, atol=1e-4)
     assert not torch.allclose(belief.mean, single.predict(x.float(), u.float()).mean)
+
+
+def taught_along(states, inputs, learned=None):
+    """What is known after each step of a flight."""
+    if learned is None:
+        learned = LearningState.begin(ChangedModel(MODEL), states[0])
+    steps = []
+    for state, input in zip(states[1:], inputs, strict=True):
+        learned = learn_from_step(learned, input, state)
+        steps.append(learned)
+    return steps
+
+
+def excited(steps, wind_from=None, seed=1):
+    random = np.random.default_rng(seed)
+    inputs = random.uniform(-3, 3, (steps, 1))
+    states = [np.zeros(2)]
+    for k, input in enumerate(inputs):
+        blows = wind_from is not None and k >= wind_from
+        state = cart(states[-1], input, wind=0.8 if blows else 0.0)
+        states.append(state + random.normal(0, NOISE))
+    return np.array(states), inputs
+
+
+def test_a_sensor_that_is_wrong_now_and_then_is_not_noisy():
+    states, inputs = excited(40)
+    states[4:40:8, 1] += 1.0  # so is every fourth difference
+    last = taught_along(states, inputs)[-1]
+    noise = _noise_variance(last.noise_ratios, last.heaviest)
+    assert (noise < 3.0 * last.model.gp_noise).all()

@@ -3,6 +3,7 @@
 import json
 import os
 import runpy
+from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +11,14 @@ import numpy as np
 import pandas
 import pytest
 
-from gpmpc.cli._learn import _doubts, _reasons_against, _save_model
+from gpmpc.cli._learn import (
+    _doubts,
+    _fingerprint_of_call,
+    _reasons_against,
+    _save_model,
+    _split,
+    _StageResults,
+)
 from gpmpc.cli._learn import _outputs as outputs_in_words
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.logs import (
@@ -650,3 +658,68 @@ def test_real_flights_are_predicted_better_than_by_baselines():
         assert (judgement.mean["model"][1:] < judgement.mean[name][1:]).all()
     assert ((judgement.coverage[1:] > 0.9) & (judgement.coverage[1:] < 0.98)).all()
     assert ((judgement.width[1:] > 0.8) & (judgement.width[1:] < 1.3)).all()
+
+
+def run_of(rows, name="run"):
+    values = np.arange(rows * 2.0).reshape(rows, 2)
+    time = 0.1 * np.arange(rows)
+    return LogRun(name, time, values[:, :1], values[:, 1:], np.empty((rows, 0)))
+
+
+@pytest.mark.parametrize(
+    ("lengths", "held_out"),
+    [
+        ([40, 300, 200, 250, 100], [200]),
+        ([300, 40], [40]),
+        ([*range(30, 41)], [32, 38]),
+        ([-25, -22, 300, 40], [40]),
+        ([-25, -22, 300], [36]),  # the last fifth of it
+        ([-28], [-29]),
+    ],
+)
+def test_runs_of_middle_length_are_held_out_by_default(lengths, held_out):
+    runs = tuple(run_of(rows + 30, f"{rows}") for rows in lengths)
+    mapping = LogMapping.from_dict({"states": {"x": ["x"]}, "inputs": {"u": ["u"]}})
+    split = _split(Log(mapping, 0.1, runs), [])
+    assert sorted(len(run) - 30 for run in split.held_out_rows) == held_out
+    assert len(split.train) + len(split.held_out_rows) == sum(map(len, runs))
+
+
+def test_outcomes_are_of_the_times_and_pieces_of_the_rows():
+    mapping = LogMapping.from_dict({"states": {"x": ["x"]}, "inputs": {"u": ["u"]}})
+    arguments = Namespace(points=10, steps=5, seed=0, for_control=False)
+    run = run_of(30)
+    logs = [
+        Log(mapping, 0.1, (run,)),
+        Log(mapping, 0.2, (replace(run, time=2 * run.time),)),
+        Log(mapping, 0.1, (replace(run, begins=(0, 10)),)),
+    ]
+    names = [_fingerprint_of_call(arguments, log) for log in (*logs, logs[0])]
+    assert names[0] == names[3]
+    assert len({*names}) == 3
+
+
+def test_stage_results_are_reused_or_a_line_says_why_not(tmp_path):
+    path = tmp_path / "progress.json"
+    memory = _StageResults(path, "name")
+    assert memory == {}
+    assert memory.begun_anew == ""
+    memory["fit"] = [1.5]
+    again = _StageResults(path, "name")
+    assert again == {"fit": [1.5]}
+    assert again.begun_anew == ""
+    stored = json.loads(path.read_text())
+    older = {"fingerprint": "name of older code", "stages": {"fit": [2.5]}}
+    for content, reason in (
+        (json.dumps(stored | {"fingerprint": "other"}), "is of other data or settings"),
+        (json.dumps(older | {"code": "0" * 32}), "is of other code of gpmpc than this"),
+        (json.dumps(older), "is of other code of gpmpc than this"),
+        ('{"fingerprint": "na', "is not whole"),
+        ("[]", "is not whole"),
+        ("[" * 100_000, "is not whole"),
+        (json.dumps(stored | {"stages": 3}), "is not whole"),
+    ):
+        path.write_text(content)
+        memory = _StageResults(path, "name")
+        assert memory == {}
+        assert memory.begun_anew == f"{path}: {reason}; all is learned anew"

@@ -25,6 +25,7 @@ from gpmpc.mpc._sqp import Globalization, Iterate
 from gpmpc.propagation import Linearization
 from gpmpc.status import Status
 from gpmpc.systems import cart_pole, pendulum, planar_quadrotor, step
+from tests.mpc.small_models import pendulum_posterior
 from tests.mpc.test_starts import known_model
 
 MEANS = PredictionSettings(covariance="none")
@@ -447,3 +448,15 @@ def test_a_locked_input_takes_no_programs_at_rest():
         decision = controller.control(almost, Reference(upright), decision)
         assert decision.status is Status.SOLVED
         assert decision.iterations <= 2
+
+
+def test_a_point_that_is_held_contradicts_no_plan_of_one_stage():
+    problem = Problem(Tracking([10.0, 1.0], [0.1]), inputs=Box([-6.0], [6.0]))
+    settings = PredictionSettings(form="velocity", covariance="none")
+    model = pendulum_posterior()
+    mpc = GPMPC(model, Linearization(), problem, 1, [0.0], settings)
+    mpc._state_ranges = np.full(2, 1e-9)
+    belief = Gaussian.certain([1.0, 1.0])
+    request = read_request(mpc.prediction, belief, Reference([[0.4, 0.0]] * 2), None)
+    local = mpc.prediction.linearize(initial_guess(mpc.prediction, request), request)
+    assert mpc._at_what_the_model_does(local, request) is local

@@ -21,7 +21,6 @@ from gpmpc.mpc import (
     Reference,
     Tracking,
 )
-from gpmpc.mpc._guess import initial_guess, read_request
 from gpmpc.mpc.baselines import StateFormMPC
 from gpmpc.propagation import Linearization, MomentMatching
 from gpmpc.status import Status
@@ -300,19 +299,3 @@ def test_a_plan_that_is_used_up_teaches_nothing():
         for state in ([1.0], *[[np.nan]] * missing, [5.0]):
             loop.input(state, [0.0])
         assert loop.last.decision.disturbance == pytest.approx(0.0)
-
-
-def test_a_point_that_is_held_contradicts_no_plan_of_one_stage():
-    mpc = GPMPC(
-        PENDULUM,
-        Linearization(),
-        PROBLEM,
-        1,
-        [0.0],
-        PredictionSettings(form="velocity", covariance="none"),
-    )
-    mpc._state_ranges = np.full(2, 1e-9)
-    belief = Gaussian.certain([1.0, 1.0])
-    request = read_request(mpc.prediction, belief, Reference([[0.4, 0.0]] * 2), None)
-    local = mpc.prediction.linearize(initial_guess(mpc.prediction, request), request)
-    assert mpc._at_what_the_model_does(local, request) is local
