@@ -59,6 +59,8 @@ from gpmpc.logs._time_step import JITTER
 from gpmpc.logs._units import TIME_UNITS
 
 EVEN = 1e-3  # of its step: a column that rises as evenly may be the time
+LEAST_RATE = 1.0  # [Hz] a single number from here on may be the rate of the rows
+MANY_COLUMNS = 20  # more than the rows: these may be signals
 LARGEST_JITTER = 0.5  # of the median step of what may be times
 MOST_USUAL = 0.9  # least share of their steps that jitter no more
 DRAWN = 3000  # points of a channel's line
@@ -557,13 +559,23 @@ def _time_hints(
 ) -> list[str]:
     """Says which columns may be the time, and which hold a single number."""
     of_title = f" of {source.title}" if source.title else ""
-    hints = [
-        f"{name}{of_title} holds a single number, {value:g}: if it is the time step, "
-        f"time: {{step: {name}}}"
-        for name, value in constants.items()
-    ]
+    hints = []
+    for name, value in constants.items():
+        if value <= 0:  # no time step
+            continue
+        text = f"{name}{of_title} holds a single number, {value:g}: if it is the "
+        text += f"time step, time: {{step: {name}}}"
+        if value >= LEAST_RATE:
+            text += f"; if it is the rate in Hz, rate: {value:.10g}"
+        hints.append(text)
     if not times.count_rows:
         return hints
+    rows, columns = source.table.shape
+    if columns >= MANY_COLUMNS and columns > rows:
+        hints.append(
+            f"{rows} rows of {columns} columns{of_title}: a row is to hold the values "
+            "of one time; if its rows are signals, transpose the file"
+        )
     for name in numbers:
         steps = np.diff(source.table[name].to_numpy(float))
         if len(steps) < 2 or not steps.min() > 0:

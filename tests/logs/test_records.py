@@ -219,6 +219,29 @@ def test_columns_by_number_are_called_as_their_signals(tmp_path):
         read_log(path, mapping_of(u=2, y=4))
 
 
+def test_a_single_number_may_be_the_rate_and_signals_may_be_rows(tmp_path):
+    table = record()
+    arrays = {"u": table["u"], "y": table["y"], "fs": 610.3515625, "Overload": 0}
+    np.savez(tmp_path / "box.npz", **arrays)
+    warnings = inspect_log(tmp_path / "box.npz").warnings
+    hints = [warning for warning in warnings if "single number" in warning]
+    assert hints == [
+        "fs holds a single number, 610.352: if it is the time step, time: {step: fs}; "
+        "if it is the rate in Hz, rate: 610.3515625"
+    ]
+    mapping = {**mapping_of(), "rate": 610.3515625}
+    del mapping["time"]
+    log = read_log(tmp_path / "box.npz", mapping)
+    assert log.time_step == pytest.approx(1 / 610.3515625)
+    table.T.to_csv(tmp_path / "lying.csv", index=False, header=False)
+    (hint,) = [
+        warning
+        for warning in inspect_log(tmp_path / "lying.csv").warnings
+        if "transpose" in warning
+    ]
+    assert hint.startswith(f"2 rows of {ROWS} columns: ")
+
+
 def test_both_commands_take_the_rate_of_rows_without_stamps(tmp_path):
     record().to_csv(tmp_path / "tank.csv", index=False)
     mapping = mapping_of(time={}, rate=4)
