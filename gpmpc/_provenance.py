@@ -42,7 +42,7 @@ def provenance() -> dict:
     """Returns what a reader needs to run the same again, as plain data."""
     return {
         "created": now(),
-        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": shlex.join([_program(Path(sys.argv[0])), *sys.argv[1:]]),
         "git": _git_commit(),
         "code": code_fingerprint_or_none(),
         "python": platform.python_version(),
@@ -53,6 +53,11 @@ def provenance() -> dict:
             "cores": os.cpu_count(),
         },
     }
+
+
+def _program(path: Path) -> str:
+    """Returns what the program is called; ``python -m gpmpc`` is gpmpc."""
+    return path.parent.name if path.name == "__main__.py" else path.name
 
 
 @cache

@@ -46,6 +46,19 @@ def checkout(tmp_path):
     return tmp_path
 
 
+@pytest.mark.parametrize(
+    ("program", "name"),
+    [
+        ("/a/gpmpc/__main__.py", "gpmpc"),
+        ("/bin/gpmpc", "gpmpc"),
+        ("a/fly.py", "fly.py"),
+    ],
+)
+def test_a_command_begins_with_the_programs_name(program, name, monkeypatch):
+    monkeypatch.setattr("sys.argv", [program, "learn", "map.yaml"])
+    assert provenance()["command"] == f"{name} learn map.yaml"
+
+
 def test_the_fingerprint_ignores_the_codes_place_and_date(checkout):
     assert source_fingerprint(checkout / "gpmpc") == code_fingerprint()
     for path in checkout.rglob("*.py"):

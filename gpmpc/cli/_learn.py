@@ -593,9 +593,10 @@ def _tube_in_words(learned: IdentifiedModel, judgement: Judgement) -> str:
         judgement.steps, judgement.tube_coverage, judgement.tube_width, strict=True
     ):
         steps = "1 step" if step == 1 else f"{step} steps"
+        form = ".2f" if width.max() < 100 else ".0f"
         by_step.append(
             f"{_range(coverage, '.0%')} of the errors {steps} ahead, and is "
-            f"{_range(width, '.2f')} times as wide as they are"
+            f"{_range(width, form)} times as wide as they are"
         )
     groups = " (smallest to largest of the groups)" if len(judgement.groups) > 1 else ""
     return (

@@ -29,6 +29,10 @@ LOOP_TITLES = {
     "model": "The paper's reading: the GP rolled on itself",
     "plant": "The plant in the loop",
 }
+_LOOPS = {  # in the title of a figure, by loop
+    "model": "the GP rolled on itself",
+    "plant": "the plant in the loop",
+}
 SUFFIXES = {"model": "", "plant": "-plant"}  # of file names, by loop
 TRAJECTORY_FIGURES = {"figure2": "elliptical", "figure3": "lorenz"}
 REFERENCES = {"states": "references", "inputs": "reference_inputs"}  # of curves
@@ -233,11 +237,11 @@ def draw_all(rows: pd.DataFrame, records: Sequence[dict]) -> dict[str, bytes]:
             followed = [r for r in flights if r["trajectory"] == trajectory]
             groups = _state_groups(followed, loop)
             if groups:
-                title = f"{trajectory} trajectory: {LOOP_TITLES[loop].lower()}"
+                title = f"{trajectory} trajectory: {_LOOPS[loop]}"
                 images[f"{figure}{suffix}.png"] = png(tracking(groups, title))
         groups = _input_groups(flights)
         if groups:
-            title = f"inputs: {LOOP_TITLES[loop].lower()}"
+            title = f"inputs: {_LOOPS[loop]}"
             images[f"figure4{suffix}.png"] = png(tracking(groups, title))
     return images | _setting_images(rows)
 

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, PercentFormatter
+from matplotlib.ticker import MaxNLocator, NullLocator, PercentFormatter
 
 from gpmpc._calls import explains_arguments
 from gpmpc.exceptions import SettingError, check_kind
@@ -20,6 +20,7 @@ from gpmpc.plotting._style import (
     figure_label,
     legend_below,
     make_figure,
+    plain_numbers,
     styled,
 )
 
@@ -206,19 +207,24 @@ def judgement_figure(judgement: "Judgement") -> Figure:
     n = len(judgement.groups)
     figure, axes = make_figure(
         width=2.6 * n,
-        height=4.8,
-        rows=2,
+        height=6.0,
+        rows=3,
         columns=n,
-        gridspec_kw={"height_ratios": [3, 1.6]},
+        gridspec_kw={"height_ratios": [3, 1.4, 1.4]},
     )
-    for group, (above, below) in enumerate(axes.T):
+    for group, (above, middle, below) in enumerate(axes.T):
         _draw_errors(above, judgement, group)
-        _draw_intervals(below, judgement, group)
-        for axis in (above, below):
+        _draw_coverage(middle, judgement, group)
+        _draw_width(below, judgement, group)
+        for axis in (above, middle, below):
             axis.set_xticks(judgement.steps, [str(step) for step in judgement.steps])
-            axis.minorticks_off()
-    axes[1, 0].set_ylabel("coverage (solid)\nwidth (dashed)")
+            axis.xaxis.set_minor_locator(NullLocator())
+        above.minorticks_off()
+        below.set_xlabel("steps ahead")
+    axes[1, 0].set_ylabel("coverage")
+    axes[2, 0].set_ylabel("width\nover errors")
     legend_below(figure, axes[0])
+    figure.align_ylabels(axes[:, 0])
     return figure
 
 
@@ -250,28 +256,37 @@ def _draw_errors(axis: Axes, judgement: "Judgement", group: int) -> None:
     )
     if not any((errors[:, group] > 0).any() for errors in judgement.mean.values()):
         axis.set_yscale("linear")  # of a state that never moves
+    else:
+        _label_by_numbers(axis)
 
 
-def _draw_intervals(axis: Axes, judgement: "Judgement", group: int) -> None:
-    """Draws coverage and width of the model's intervals for a group of states."""
-    steps = judgement.steps
+def _draw_coverage(axis: Axes, judgement: "Judgement", group: int) -> None:
+    """Draws how many errors of a group the model's intervals hold, and should."""
     coverage = judgement.coverage[:, group]
     low, high = judgement.coverage_interval[:, group].T
     bars = np.maximum([coverage - low, high - coverage], 0)
-    axis.errorbar(steps, coverage, bars, color=BLUE, marker="o", capsize=3)
-    axis.plot(
-        steps, judgement.width[:, group], color=VERMILION, marker="s", linestyle="--"
-    )
+    axis.errorbar(judgement.steps, coverage, bars, color=BLUE, marker="o", capsize=3)
     axis.axhline(judgement.level, color="0.6", linewidth=0.8)
-    shown = np.concatenate(
-        [coverage, low, judgement.width[:, group], [judgement.level]]
-    )
-    shown = shown[np.isfinite(shown)]
-    axis.set(
-        xscale="log",
-        ylim=(min(0.5, shown.min() - 0.05), max(1.5, 1.1 * shown.max())),
-        xlabel="steps ahead",
-    )
+    shown = np.concatenate([coverage, low])
+    lowest = shown[np.isfinite(shown)].min(initial=0.55)
+    axis.set(xscale="log", ylim=(lowest - 0.05, 1.05))
+
+
+def _draw_width(axis: Axes, judgement: "Judgement", group: int) -> None:
+    """Draws how wide the model's intervals are over what the errors of a group are."""
+    width = judgement.width[:, group]
+    width = np.where(np.isfinite(width) & (width > 0), width, np.nan)
+    axis.loglog(judgement.steps, width, color=BLUE, marker="s")
+    axis.axhline(1.0, color="0.6", linewidth=0.8)
+    shown = width[np.isfinite(width)]
+    axis.set_ylim(shown.min(initial=0.5) / 1.5, 1.5 * shown.max(initial=2.0))
+    _label_by_numbers(axis)
+
+
+def _label_by_numbers(axis: Axes) -> None:
+    """Labels a logarithmic axis of values so that at least two numbers stand at it."""
+    low, high = axis.get_ylim()
+    plain_numbers(axis.yaxis, few=high < 100 * low)
 
 
 @explains_arguments

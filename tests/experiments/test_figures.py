@@ -9,11 +9,13 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from hydra import compose, initialize_config_dir
 
 from gpmpc.datasets import PaperData
 from gpmpc.exceptions import SettingError
+from gpmpc.experiments import figures_drawing
 from gpmpc.experiments.figures import Figures, Row
 from gpmpc.experiments.figures_tables import LOOP_TITLES, paper_seconds, summarise
 from gpmpc.gp import SoftLimits, identity, train
@@ -330,6 +332,21 @@ def test_the_nonlinear_controller_starts_from_reference_inputs():
     assert decision.status.solved
     assert decision.iterations <= 2
     assert np.allclose(decision.inputs, inputs[:1], atol=1e-3)
+
+
+def test_titles_keep_their_capital_letters(monkeypatch):
+    titles = []
+    monkeypatch.setattr(figures_drawing, "_shown", list)
+    monkeypatch.setattr(figures_drawing, "_state_groups", lambda flights, _: flights)
+    monkeypatch.setattr(figures_drawing, "_input_groups", lambda _: [])
+    monkeypatch.setattr(figures_drawing, "_setting_images", lambda _: {})
+    monkeypatch.setattr(
+        figures_drawing, "tracking", lambda _, title: titles.append(title)
+    )
+    monkeypatch.setattr(figures_drawing, "png", lambda _: b"")
+    record = {"drawn": {}, "loop": "model", "trajectory": "elliptical"}
+    assert [*figures_drawing.draw_all(pd.DataFrame(), [record])] == ["figure2.png"]
+    assert titles == ["elliptical trajectory: the GP rolled on itself"]
 
 
 def test_the_page_has_a_line_for_every_row_of_the_csv_file(

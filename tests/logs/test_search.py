@@ -663,14 +663,16 @@ def test_a_state_that_never_moves_is_drawn(recwarn):
 
 
 @pytest.mark.parametrize(
-    ("coverage", "width", "limits"),
+    ("coverage", "width", "limits_of_coverage", "limits_of_width"),
     [
-        (0.3, 4.0, (0.15, 4.4)),
-        (0.95, 1.0, (0.5, 1.5)),
-        (np.nan, np.nan, (0.5, 1.5)),
+        (0.3, 17000.0, (0.15, 1.05), (1 / 3, 25500.0)),
+        (0.95, 1.0, (0.5, 1.05), (1 / 3, 3.0)),
+        (np.nan, np.nan, (0.5, 1.05), (1 / 3, 3.0)),
     ],
 )
-def test_intervals_are_shown_however_wrong_they_are(coverage, width, limits):
+def test_intervals_are_shown_however_wrong_they_are(
+    coverage, width, limits_of_coverage, limits_of_width
+):
     errors = np.ones((2, 1))
     coverage = np.array([[coverage], [np.nan]])
     width = np.array([[width], [np.nan]])
@@ -685,8 +687,9 @@ def test_intervals_are_shown_however_wrong_they_are(coverage, width, limits):
         width=width,
         windows=20,
     )
-    shown = judgement_figure(judgement).axes[1].get_ylim()
-    assert shown == pytest.approx(limits)
+    _, axis_of_coverage, axis_of_width = judgement_figure(judgement).axes
+    assert axis_of_coverage.get_ylim() == pytest.approx(limits_of_coverage)
+    assert axis_of_width.get_ylim() == pytest.approx(limits_of_width)
 
 
 def test_one_stretch_tells_no_average_from_chance():
