@@ -214,8 +214,8 @@ def judgement_figure(judgement: "Judgement") -> Figure:
     )
     for group, (above, middle, below) in enumerate(axes.T):
         _draw_errors(above, judgement, group)
-        _draw_coverage(middle, judgement, group)
-        _draw_width(below, judgement, group)
+        _draw_interval_coverage(middle, judgement, group)
+        _draw_interval_width(below, judgement, group)
         for axis in (above, middle, below):
             axis.set_xticks(judgement.steps, [str(step) for step in judgement.steps])
             axis.xaxis.set_minor_locator(NullLocator())
@@ -260,7 +260,7 @@ def _draw_errors(axis: Axes, judgement: "Judgement", group: int) -> None:
         _label_by_numbers(axis)
 
 
-def _draw_coverage(axis: Axes, judgement: "Judgement", group: int) -> None:
+def _draw_interval_coverage(axis: Axes, judgement: "Judgement", group: int) -> None:
     """Draws how many errors of a group the model's intervals hold, and should."""
     coverage = judgement.coverage[:, group]
     low, high = judgement.coverage_interval[:, group].T
@@ -272,7 +272,7 @@ def _draw_coverage(axis: Axes, judgement: "Judgement", group: int) -> None:
     axis.set(xscale="log", ylim=(lowest - 0.05, 1.05))
 
 
-def _draw_width(axis: Axes, judgement: "Judgement", group: int) -> None:
+def _draw_interval_width(axis: Axes, judgement: "Judgement", group: int) -> None:
     """Draws how wide the model's intervals are over what the errors of a group are."""
     width = judgement.width[:, group]
     width = np.where(np.isfinite(width) & (width > 0), width, np.nan)
