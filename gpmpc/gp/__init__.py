@@ -1,4 +1,11 @@
-"""Gaussian process models of dynamics: data, training, and posteriors that predict."""
+"""Gaussian process models of dynamics: data, training, and posteriors that predict.
+
+``train`` or a ``Trainer`` makes a ``GPPosterior`` of ``Transitions``; a
+``SparseTrainer`` does so for tens of thousands of rows. ``from_gpytorch`` and
+``KernelPosterior`` take models that GPyTorch has trained. ``append_transitions``,
+``remove_points`` and ``SlidingWindow`` change a posterior's data. ``save_posterior``
+and ``load_posterior`` keep it in a file.
+"""
 
 from gpmpc.gp._backend import backend
 from gpmpc.gp._gpytorch import from_gpytorch, to_gpytorch

@@ -1,5 +1,10 @@
 """Models of dynamics: the protocol, and models of a known part and a learned one.
 
+``train(rows, system=...)`` makes the model that a system's description allows.
+``ResidualModel`` is made by hand of a nominal model and GPs. ``DelayedModel``,
+``DisturbedModel`` and ``NoisyModel`` wrap any model; ``load_model`` reads what
+``save_model`` wrote.
+
 All models with a GP are one family: a nominal model, and GPs on what it leaves,
 
     y[k] = nominal(x[k], u[k]) + d(phi(x[k], u[k])),     x[k+1] = step(x[k], y[k]).
@@ -8,9 +13,8 @@ They differ in what y is. Of a ``ResidualModel`` it is the next state itself, an
 derivatives are exact. Of a ``LogModel``, made for measured flights, it is outputs such
 as accelerations, which kinematics turn into a movement; ``LogDynamics`` makes a
 ``DynamicsModel`` of it. All are rolled out by the recursion ``iterate`` of
-``_roll_out`` (or its compiled form), and read by ``load_model``. Wrappers around any of
-them are linear but for the model inside: a delay, disturbances as states; or they add
-noise.
+``_roll_out`` or its compiled form. Wrappers add a delay or disturbances as states, and
+are linear but for the model inside; or they add noise.
 
 Nominal models are of three kinds: of a ``ResidualModel`` a function of tensors, from
 state and input to next state (``_nominal``); of a ``LogModel`` a ``ParametricNominal``,

@@ -1,4 +1,9 @@
-"""Propagation of Gaussian beliefs through learned models, and local models of it.
+"""Moves Gaussian beliefs through models, and linearises that for controllers.
+
+``Linearization``, ``MomentMatching``, ``Unscented``, ``MonteCarlo`` and
+``MeanEquivalence`` are the propagators. ``rollout`` applies one along inputs,
+``differentiate`` gives its derivatives, and ``linearize`` a linear system of mean and
+covariance root.
 
 ``_propagator`` holds the protocol and derivatives by autograd; ``_linearization``,
 ``_points`` and ``_moment_matching`` the propagators, the last on top of ``_moments``,

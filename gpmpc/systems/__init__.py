@@ -1,4 +1,10 @@
-"""Systems that are controlled: their names, their dynamics, how they are flown."""
+"""Systems that are controlled: their names, dynamics, units, limits and goals.
+
+A ``System`` describes one, from a class with ``derivative`` or ``successor``. ``sin``,
+``where`` and the other functions of this package take floats, arrays and CasADi's
+symbols. ``step`` and ``step_many`` move a system on. ``pendulum``, ``cart_pole``,
+``translational`` and others make systems that come with the package.
+"""
 
 from gpmpc.systems._elementary import (
     abs,
