@@ -2,8 +2,8 @@
 
     main -> _main (words to a command) -> _commands (the list) -> _NAME (the command)
 
-What stands here is there before any library: Ctrl-C, or the signal by which systems end
-a process (SIGTERM), ends the command with one line from its first moment on.
+This module is loaded before any library, so that Ctrl-C and SIGTERM, by which systems
+end a process, end the command with one line from its first moment on.
 """
 
 import signal

@@ -1,7 +1,7 @@
 """Studies: conditions and seeds, their trials, the store of records, and the tables.
 
-    flight    one trial: an experiment is flown, measured and told in words
-    study     the engine: trials of all conditions and seeds, the store, the records
+    flight    one trial: an experiment is flown, measured and summed up in words
+    study     trials of all conditions and seeds, and the store of their records
     tuning    a search for the settings of least cost
     report    a tree of runs as one table with figures, and whether two groups differ
 

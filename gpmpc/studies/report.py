@@ -1,4 +1,4 @@
-"""Shows a tree of runs: a row a cell, figures over what was varied, what is missing.
+"""Shows a tree of runs: a row per cell, figures over varied settings, missing runs.
 
 Two groups of runs are compared seed by seed in ``_comparison``.
 """

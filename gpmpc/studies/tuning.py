@@ -1,10 +1,10 @@
 """Searches settings for the least cost, with Optuna.
 
 The search uses tree-structured Parzen estimators (Bergstra et al., 2011). Candidates
-come in batches, whose costs are all told before the next one. The random numbers of a
-candidate follow from the seed and from its number, and its proposal from the costs told
-before: a search that is repeated, or that goes on where it was killed with costs from
-files, proposes the same candidates bit for bit.
+come in batches; the costs of one batch are all known before the next one is proposed.
+The random numbers of a candidate follow from the seed and from its number, and its
+proposal from the costs of earlier batches. So a search that is repeated, or that goes
+on where it was killed, proposes the same candidates bit for bit.
 """
 
 import math
