@@ -62,8 +62,8 @@ class Signal:
     #: as they are called in the file, or their numbers in it, from "1" on
     columns: tuple[str, ...]
     unit: str = ""  #: of the columns in the file
-    #: A vector, angles, a quaternion, or Euler angles (roll, pitch, yaw; they become a
-    #: quaternion).
+    #: A vector, angles, a quaternion, Euler angles (roll, pitch, yaw; they become a
+    #: quaternion), or the heading of a quaternion (one angle).
     kind: str = "vector"
     order: str = "xyzw"  #: of a quaternion: "xyzw" or "wxyz"
     #: The frame that a rigid body's velocity or rate is measured in: "world" or "body";
@@ -95,7 +95,7 @@ class Signal:
     def _check_choices(self) -> None:
         interpolation = "spherical" if self.is_attitude else "linear"
         for name, choices in (
-            ("kind", ("vector", "angle", "quaternion", "euler")),
+            ("kind", ("vector", "angle", "quaternion", "euler", "heading")),
             ("order", ("xyzw", "wxyz")),
             ("frame", ("", "world", "body")),
             ("axes", ("", *AXES)),
@@ -105,7 +105,8 @@ class Signal:
             check_choice(f"{self._key}.{name}", getattr(self, name), choices)
 
     def _check_columns(self) -> None:
-        number = {"quaternion": 4, "euler": 3}.get(self.kind, len(self.columns))
+        numbers = {"quaternion": 4, "euler": 3, "heading": 4}
+        number = numbers.get(self.kind, len(self.columns))
         are_texts = all(isinstance(column, str) for column in self.columns)
         if not self.columns or len(self.columns) != number or not are_texts:
             raise SettingError(
@@ -123,10 +124,11 @@ class Signal:
             check_number(f"{self._key}.{name}", value)
 
     def _check_delay(self) -> None:
-        if self.is_attitude and len(set(self.delays)) > 1:
+        if self.combines_columns and len(set(self.delays)) > 1:
             raise SettingError(
                 f"{self._key}.delay",
-                f"must be one number for an attitude; got {list(self.delays)}",
+                "must be one number for an attitude or a heading; got "
+                f"{list(self.delays)}",
             )
 
     def _check_texts(self) -> None:
@@ -153,6 +155,11 @@ class Signal:
         return self.kind in ("quaternion", "euler")
 
     @property
+    def combines_columns(self) -> bool:
+        """Whether each of its entries is made of all its columns."""
+        return self.is_attitude or self.kind == "heading"
+
+    @property
     def rule(self) -> str:
         """The rule by which it is resampled."""
         if self.resample:
@@ -177,7 +184,12 @@ class Signal:
 
     @property
     def entries(self) -> tuple[str, ...]:
-        """The names of its values: those of the columns, or its own for numbers."""
+        """The names of its values: those of the columns, or its own for numbers.
+
+        A heading has its own.
+        """
+        if self.kind == "heading":
+            return (self.name,)
         if not any(column.isdecimal() for column in self.columns):
             return self.columns
         if len(self.columns) == 1:
@@ -202,11 +214,12 @@ class Signal:
             return StateGroup(
                 name=self.name, entries=entries, unit="", kind="quaternion"
             )
+        is_angle = self.kind in ("angle", "heading")
         return StateGroup(
             name=self.name,
             entries=self.entries,
-            unit=self._conversion.unit,
-            kind="angle" if self.kind == "angle" else "vector",
+            unit="rad" if is_angle else self._conversion.unit,
+            kind="angle" if is_angle else "vector",
         )
 
 
@@ -403,7 +416,7 @@ class LogMapping:
         return tuple(names)
 
     def _names_of(self, signal: Signal) -> list[str]:
-        if signal.kind == "euler":
+        if signal.kind in ("euler", "heading"):
             return list(signal.group.entries)
         names = [
             name if factor == 1 else f"{name} times {factor:.6g}"

@@ -377,7 +377,7 @@ def _signal_on_grid(
     interpolation = Interpolation(
         rule=signal.rule,
         max_gap=mapping.max_gap or USUAL_GAP * usual_step,
-        angles=signal.kind == "angle",
+        angles=signal.group.kind == "angle",
     )
     # What was measured at a time has a stamp that is later by the delay.
     delays = signal.delays

@@ -132,6 +132,11 @@ def read_signal(
     findings.add("empty sample", absent.sum(), text)
     if signal.kind == "quaternion":
         return _unit_quaternions(where, values, signal, findings, is_kept)
+    if signal.kind == "heading":
+        quaternions = _unit_quaternions(where, values, signal, findings, is_kept)
+        headings = _headings(quaternions)
+        _note_turns(headings, signal, findings, is_next_step)
+        return headings
     kept_values = np.where(is_kept[:, None], values, np.nan)
     _check_angles(where, kept_values, signal, findings, is_next_step)
     _note_turns(values, signal, findings, is_next_step)
@@ -192,7 +197,7 @@ def _note_turns(
 
     Models take the sine and the cosine of angles of states alone.
     """
-    if signal.kind != "angle" or signal.role == "states":
+    if signal.group.kind != "angle" or signal.role == "states":
         return
     jumps = np.abs(np.diff(values, axis=0)[is_next_step[1:]]) > np.pi
     text = (
@@ -250,6 +255,13 @@ def _euler_to_quaternions(angles: Array, present: np.ndarray) -> Array:
     turns = Rotation.from_euler("ZYX", angles[present, ::-1])
     quaternions[present] = turns.as_quat()
     return _with_steady_signs(quaternions).quaternions
+
+
+def _headings(quaternions: Array) -> Array:
+    """Computes the yaw (K, 1) [rad] of quaternions (x, y, z, w) (K, 4)."""
+    x, y, z, w = quaternions.T
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return yaw[:, None]
 
 
 def _unit_quaternions(

@@ -211,7 +211,7 @@ def _note_held_sensors(
     for signal, columns in zip(
         mapping.of("states"), mapping.space.columns, strict=True
     ):
-        if signal.is_attitude or (signal.held or mapping.held) == "use":
+        if signal.combines_columns or (signal.held or mapping.held) == "use":
             continue
         for index, name in enumerate(signal.columns, start=columns.start):
             others_move = np.any(np.delete(motion, index, axis=1), axis=1)

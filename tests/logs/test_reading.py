@@ -341,6 +341,37 @@ def test_an_angle_that_wraps_is_interpolated_the_short_way_round(tmp_path):
     assert np.abs(away - away[0]).max() < 1e-9
 
 
+@pytest.mark.parametrize("order", ["xyzw", "wxyz"])
+def test_the_heading_of_a_quaternion_is_an_angle(tmp_path, order):
+    table = pendulum_table().assign(x=lambda table: 0.5 * table.t, y=0.0, v=0.5)
+    yaw = 2.0 * table.t  # turns twice
+    tilt = np.full(len(table), 0.1)
+    turns = Rotation.from_euler("ZYX", np.column_stack([yaw, tilt, -tilt]))
+    signs = np.where(np.arange(len(table)) % 3, 1, -1)  # of the same attitude
+    table[list("abcd")] = signs[:, None] * np.roll(
+        turns.as_quat(), 1 if order == "wxyz" else 0, axis=1
+    )
+    heading = {"columns": [*"abcd"], "kind": "heading", "order": order}
+    mapping = {
+        "time": "t",
+        "model": "bicycle",
+        "held": "use",
+        "states": {"position": ["x", "y"], "heading": heading, "speed": ["v"]},
+        "inputs": {"steering": ["torque"], "drive": ["rate"]},
+    }
+    for rate, rows in ((None, 400), (40, 320)):
+        log = read_log(written(tmp_path, table), {**mapping, "rate": rate})
+        assert (log.space.angles, len(log)) == ((2,), rows)
+        assert log.mapping.column_names("states")[2] == "heading"
+        run = log.runs[0]
+        np.testing.assert_allclose(
+            wrap(run.states[:, 2] - 2 * (run.time - run.time[0])), 0, atol=1e-9
+        )
+    heading["delay"] = [0.1, 0.1, 0.2, 0.1]
+    with pytest.raises(SettingError, match="one number for an attitude or a heading"):
+        LogMapping.from_dict(mapping)
+
+
 def test_a_repeated_sample_of_a_moving_system_is_left_out(tmp_path):
     table = body_table()
     table.loc[[100, 101, 102], ["px", "py", "pz"]] = table.loc[
