@@ -19,6 +19,7 @@ from rich.console import Console
 
 from gpmpc._compiling import report_compilation
 from gpmpc._provenance import own_code
+from gpmpc._remarks import remarks_to
 from gpmpc.cli._commands import Result
 from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._folders import folder_of, writing
@@ -27,7 +28,7 @@ from gpmpc.cli._mlflow import track
 from gpmpc.cli._overrides import choices, folder_choice
 from gpmpc.cli._plain_settings import plain_settings
 from gpmpc.cli._settings import config_source_options, run_command
-from gpmpc.cli._terminal import OutputEnded, print_error, remarks_to
+from gpmpc.cli._terminal import OutputEnded, print_error
 from gpmpc.exceptions import DataError, SettingError, ShapeError
 from gpmpc.recording import McapRecorder, RecordedSystem
 from gpmpc.simulation import Step

@@ -9,6 +9,7 @@ on, so a study that was killed at any moment goes on where it stopped.
 
 import hashlib
 import json
+import logging
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
@@ -16,7 +17,7 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -25,6 +26,7 @@ from threadpoolctl import threadpool_limits
 
 from gpmpc._compiling import report_compilation
 from gpmpc._provenance import code_fingerprint, own_code
+from gpmpc._remarks import remarks_to
 from gpmpc.exceptions import (
     Diverged,
     GpmpcError,
@@ -40,6 +42,9 @@ from gpmpc.parallel import in_processes
 from gpmpc.studies._document import Document, Table
 
 __all__ = ["Document", "Study", "Table", "TrialSpec", "TrialStore", "run_study"]
+
+
+_log = logging.getLogger(__name__)
 
 
 class LostFlight(GpmpcError):
@@ -125,7 +130,8 @@ def run_study(
         trials: All of the study.
         store: Where records are kept.
         workers: Processes; None takes one a core.
-        progress: Called with every record, whether it was there or is new.
+        progress: Called with every record, whether it was there or is new. What trials
+            warn of is logged once before it.
 
     Returns:
         One record a trial, in their order.
@@ -141,15 +147,21 @@ def run_study(
             missing[trial.fingerprint] = trial
     jobs = list(missing.values())
     not_kept: dict[str, dict] = {}
+    remarked: set[str] = set()
     run = partial(_run_in_worker, run_trial)
     try:
         with closing(in_processes(run, jobs, workers)) as finished:
-            for index, (record, is_result) in finished:
-                if is_result:
+            for index, ended in finished:
+                record = ended.record
+                if ended.is_result:
                     store.append(jobs[index].fingerprint, record)
                 else:
                     record["is_result"] = False
                     not_kept[jobs[index].fingerprint] = record
+                for text in ended.remarks:
+                    if text not in remarked:
+                        remarked.add(text)
+                        _log.warning(text)
                 progress(record)
     except BrokenProcessPool as error:
         raise GpmpcError(
@@ -170,21 +182,30 @@ def is_failed(record: Mapping[str, Any]) -> bool:
     return not record.get("is_result", True)
 
 
-@report_compilation()
-def _run_in_worker(
-    run_trial: RunTrial, trial: TrialSpec
-) -> tuple[dict[str, Any], bool]:
-    """Runs one trial in a worker process.
+class _EndOfTrial(NamedTuple):
+    """What a worker process hands back of a trial."""
 
-    Returns:
-        Its record, and whether it would be the same if the trial were run again.
-    """
+    record: dict[str, Any]
+    #: whether the record would be the same if the trial were run again
+    is_result: bool
+    #: what the package warned of on the way
+    remarks: Sequence[str]
+
+
+@report_compilation()
+def _run_in_worker(run_trial: RunTrial, trial: TrialSpec) -> _EndOfTrial:
+    """Runs one trial in a worker process."""
     record = {**trial.labels, "seed": trial.seed}
-    try:
-        with one_thread():
-            return record | run_trial(trial), True
-    except (GpmpcError, _LinAlgError) as error:
-        return record | {"error": str(error)}, isinstance(error, _RESULTS)
+    is_result = True
+    remarks: list[str] = []
+    with remarks_to(remarks.append):
+        try:
+            with one_thread():
+                record |= run_trial(trial)
+        except (GpmpcError, _LinAlgError) as error:
+            record["error"] = str(error)
+            is_result = isinstance(error, _RESULTS)
+    return _EndOfTrial(record, is_result, remarks)
 
 
 class TrialStore:

@@ -4,6 +4,7 @@ Its seeds and names follow from its settings.
 """
 
 import json
+import logging
 import os
 from concurrent.futures.process import BrokenProcessPool
 
@@ -127,6 +128,16 @@ def test_missing_trials_run_and_records_keep_their_order(tmp_path, started):
     )
     assert [record["seed"] for record in again] == [3, 4, 5, 6]
     assert len(started) == 3
+
+
+def test_what_trials_remark_is_said_once(tmp_path, started, caplog):
+    def remark(trial):
+        logging.getLogger("gpmpc.gp").warning("few rows")
+        return {}
+
+    trials = [TrialSpec({}, None, seed, f"print{seed}") for seed in range(3)]
+    run_study(remark, trials, TrialStore(tmp_path / "trials.jsonl"))
+    assert [record.getMessage() for record in caplog.records] == ["few rows"]
 
 
 def test_a_trial_that_failed_by_its_surroundings_is_run_again(tmp_path, started):
