@@ -250,9 +250,12 @@ class _Search:
         fitting = [count for count in counts if self._fits(count)]
         if not fitting:
             least = counts[-1]
-            excesses = " and ".join(self._budget.excesses(self._footprint(least)))
+            footprint = self._footprint(least)
+            excesses = " and ".join(self._budget.excesses(footprint))
             raise SettingError(
-                "budget", f"nothing fits: {least} points, the fewest, need {excesses}"
+                "budget",
+                f"nothing fits: {least} points, the fewest, need {excesses}; "
+                f"measured: {footprint.compiler}",
             )
         points = self._largest(fitting[0], counts)
         rows = [self._row(count) for count in sorted({*counts, points}, reverse=True)]
