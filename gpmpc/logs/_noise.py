@@ -337,10 +337,7 @@ def _mean_of_finite(squared: Sequence[Array]) -> Array:
     Infinite where all of them did.
     """
     errors = np.concatenate(squared)
-    converged = errors < DIVERGED**2
-    number = converged.sum(axis=0)
-    total = np.where(converged, errors, 0.0).sum(axis=0)
-    return np.where(number > 0, total / np.maximum(number, 1), np.inf)
+    return _usual_mean(np.where(errors < DIVERGED**2, errors, np.nan))
 
 
 def _usual_mean(squared: Array) -> Array:
@@ -350,16 +347,21 @@ def _usual_mean(squared: Array) -> Array:
     interval as wide as such an error would be too wide ever after.
 
     Args:
-        squared: Of windows, those of a run one after the other.
+        squared: Of windows, those of a run one after the other. NaN does not count;
+            the mean is infinite where there is nothing else.
     """
-    stretches = min(_STRETCHES, len(squared) // _WINDOWS_PER_STRETCH)
-    if stretches <= 2 * _RARE_STRETCHES:
-        return squared.mean(axis=0)
+    stretches = max(min(_STRETCHES, len(squared) // _WINDOWS_PER_STRETCH), 1)
     parts = np.array_split(squared, stretches)
-    means = np.array([part.mean(axis=0) for part in parts])
-    next_mean = np.sort(means, axis=0)[-1 - _RARE_STRETCHES]
-    means = np.where(next_mean > 0, np.minimum(means, _RAREST_ERROR * next_mean), means)
-    return np.average(means, axis=0, weights=[len(part) for part in parts])
+    counts = np.array([np.sum(~np.isnan(part), axis=0) for part in parts])
+    sums = np.array([np.nansum(part, axis=0) for part in parts])
+    means = sums / np.maximum(counts, 1)
+    if stretches > 2 * _RARE_STRETCHES:
+        next_mean = np.sort(means, axis=0)[-1 - _RARE_STRETCHES]
+        capped = np.minimum(means, _RAREST_ERROR * next_mean)
+        means = np.where(next_mean > 0, capped, means)
+    count = counts.sum(axis=0)
+    total = (counts * means).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.inf)
 
 
 def _nonnegative_solution(regressors: Array, targets: Array) -> Array:

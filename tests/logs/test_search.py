@@ -32,6 +32,7 @@ from gpmpc.logs._noise import (
     fit_noise,
     learning_gains,
     noise_steps,
+    tube_variances,
 )
 from gpmpc.logs._ranges import ranges_of
 from gpmpc.logs._rollout_corrections import (
@@ -633,10 +634,15 @@ def test_noise_is_not_that_of_one_wild_stretch():
     still = AffineNominal(kinematics, fitted=False)
     model = LogModel(kinematics, still, np.empty(0), history=(0, 0))
     noise = fit_noise([model], [log], noise_steps(50))
-    variances = error_variances(model, log.windows(50, past=1), noise, (1, 10, 50))
-    ratios = variances.mean(axis=0) / np.array([[1.0], [10.0], [50.0]])
-    assert (ratios > 0.7).all()
-    assert (ratios < 1.6).all()
+    steps = (1, 10, 50)
+    windows = log.windows(50, past=1)
+    for variances in (
+        error_variances(model, windows, noise, steps),
+        tube_variances(model, windows, noise.tube, steps),
+    ):
+        ratios = variances.mean(axis=0) / np.array([[1.0], [10.0], [50.0]])
+        assert (ratios > 0.7).all()
+        assert (ratios < 1.6).all()
 
 
 def test_noise_is_fitted_to_what_is_finite():
