@@ -28,6 +28,7 @@ IMPORTED += [
     "gpmpc.experiments.tables",
 ]
 IMPORTED += ["gpmpc.studies.report", "gpmpc.studies.flight", "gpmpc.plotting._recorded"]
+IMPORTED += ["tests.cli.numba_registries"]  # found where the suite starts in its folder
 SECONDS = 300  # a command may take
 ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)  # what it listens to
 
