@@ -27,31 +27,20 @@ def test_every_import_contract_is_kept():
     assert linted.returncode == 0, linted.stdout + linted.stderr
 
 
-@pytest.mark.parametrize("module", ["gpmpc.qp"])
-def test_the_qp_solvers_load_no_torch(module):
-    forbidden = ["torch", "gpytorch", "hydra", "casadi", "matplotlib"]
-    code = f"import sys, {module}; print([m for m in {forbidden} if m in sys.modules])"
-    loaded = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    ).stdout.strip()
-    assert loaded == "[]"
-
-
-def test_gp_modules_load_no_optimiser_settings_or_figures():
-    forbidden = ["hydra", "cvxpy", "mcap", "casadi", "matplotlib", "rich"]
-    code = (
-        f"import sys, gpmpc.gp, gpmpc.models, gpmpc.propagation; print([m for "
-        f"m in {forbidden} if m in sys.modules])"
-    )
-    loaded = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    ).stdout.strip()
-    assert loaded == "[]"
-
-
-@pytest.mark.parametrize(
-    ("modules", "forbidden"),
-    [
+#: groups of modules that one process imports after another, with what none may load
+LIGHT_IMPORTS = {
+    "solvers and controllers": [
+        ("gpmpc.qp", ["torch", "gpytorch", "hydra", "casadi", "matplotlib"]),
+        (
+            "gpmpc.gp, gpmpc.models, gpmpc.propagation",
+            ["hydra", "cvxpy", "mcap", "casadi", "matplotlib", "rich"],
+        ),
+        (
+            "gpmpc.mpc, gpmpc.mpc.gp_mpc, gpmpc.mpc.baselines, gpmpc.testing",
+            ["cvxpy", "hydra", "matplotlib"],
+        ),
+    ],
+    "runs that are read": [
         (
             "gpmpc.recording",
             ["torch", "numba", "scipy", "hydra", "matplotlib", "pandas"],
@@ -61,13 +50,25 @@ def test_gp_modules_load_no_optimiser_settings_or_figures():
             ["torch", "numba", "casadi"],
         ),
     ],
-)
-def test_reading_runs_needs_neither_torch_nor_compilers(modules, forbidden):
-    code = f"import sys, {modules}; print([m for m in {forbidden} if m in sys.modules])"
-    loaded = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    ).stdout.strip()
-    assert loaded == "[]"
+}
+
+
+@pytest.mark.parametrize("process", LIGHT_IMPORTS)
+def test_importing_a_room_loads_no_library_it_does_not_need(process):
+    lines = ["import sys"]
+    for modules, forbidden in LIGHT_IMPORTS[process]:
+        lines.append(f"import {modules}")
+        loaded = f"[name for name in {forbidden} if name in sys.modules]"
+        lines.append(f"print({modules!r}, {loaded})")
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(lines)],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.splitlines() == [
+        f"{modules} []" for modules, _ in LIGHT_IMPORTS[process]
+    ]
 
 
 @pytest.mark.parametrize(

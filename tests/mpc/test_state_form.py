@@ -1,5 +1,3 @@
-import subprocess
-import sys
 from functools import partial
 from itertools import product
 
@@ -152,13 +150,3 @@ def test_a_bound_without_a_number_is_numerical_trouble():
     belief = Gaussian(torch.zeros(2).double(), torch.eye(2).double())
     decision = controller.control(belief, Reference(np.zeros((7, 2))))
     assert decision.status is Status.NUMERICAL_TROUBLE
-
-
-def test_importing_the_controllers_does_not_load_cvxpy():
-    modules = "gpmpc.mpc, gpmpc.mpc.gp_mpc, gpmpc.mpc.baselines"
-    heavy = ("cvxpy", "hydra", "matplotlib")
-    code = f"import sys, {modules}; print([m for m in {heavy} if m in sys.modules])"
-    loaded = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    ).stdout.strip()
-    assert loaded == "[]"

@@ -1,5 +1,3 @@
-import subprocess
-import sys
 from time import sleep
 
 import cvxpy
@@ -17,17 +15,6 @@ def test_an_unknown_solver_is_refused_with_those_installed():
         ProblemError, match=r"no solver named 'GUROBIX'; it finds .*CLARABEL"
     ):
         CvxpySolver("GUROBIX")
-
-
-def test_cvxpy_is_loaded_only_when_it_is_used():
-    code = """
-import sys
-import gpmpc.qp, gpmpc.testing
-assert "cvxpy" not in sys.modules
-gpmpc.qp.CvxpySolver()
-assert "cvxpy" in sys.modules
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize("name", ["CLARABEL", "DAQP", "OSQP"])
