@@ -277,7 +277,7 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
 
 
 def test_the_traceback_is_there_for_who_asks(tmp_path):
-    result = gpmpc("tables", "draws=0", "--debug", cwd=tmp_path)
+    result = forked("tables", "draws=0", "--debug", cwd=tmp_path)
     assert result.returncode != 0
     assert "Traceback" in result.stderr
 

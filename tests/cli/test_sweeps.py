@@ -317,7 +317,7 @@ def test_a_mistake_found_in_flight_is_kept_with_its_traceback(tmp_path):
 def sweep(tmp_path_factory):
     """Four runs, one after another."""
     cwd = tmp_path_factory.mktemp("sweep")
-    done = gpmpc(*SWEPT, "folder=tree", cwd=cwd)
+    done = forked(*SWEPT, "folder=tree", cwd=cwd)
     assert done.returncode == 0, done.stderr
     assert "4 runs: 4 flown, 0 finished before, 0 failed" in done.stdout
     assert "4/4" in done.stdout

@@ -2,9 +2,6 @@
 
 import csv
 import json
-import os
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -47,30 +44,10 @@ TINY = [
 TINY += ["subsystem=[translational,rotational]", "folder=out"]
 
 
-def gpmpc(*arguments, cwd):
-    command = [
-        sys.executable,
-        "-c",
-        "from gpmpc.cli import main; main()",
-        "figures",
-        *arguments,
-    ]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    return subprocess.run(
-        command,
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        env=environment,
-        timeout=300,
-        check=False,
-    )
-
-
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("figures")
-    return folder, gpmpc(*TINY, cwd=folder)
+    return folder, forked("figures", *TINY, cwd=folder)
 
 
 def test_one_command_writes_all_tables_and_figures(finished):
