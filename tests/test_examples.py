@@ -101,7 +101,7 @@ def test_the_example_of_a_payload_learns_and_corrects(tmp_path, monkeypatch):
     whole_film = plotting.film
 
     def short_film(run, system, path, frames, enlarged):
-        whole_film(run, system, path, frames=frames // 6, enlarged=enlarged)
+        whole_film(run, system, path, frames=frames // 20, enlarged=enlarged)
 
     monkeypatch.setattr(plotting, "film", short_film)
     monkeypatch.setattr(sys, "argv", ["payload.py", str(tmp_path)])

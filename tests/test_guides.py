@@ -52,9 +52,9 @@ def test_simulators_are_systems(page):
     pytest.importorskip("gymnasium")
     pytest.importorskip("mujoco")
     names, (flown, quadrotor, filmed) = page(
-        "docs/guide_simulator.md", shortened=[("steps=100", "steps=20")]
+        "docs/guide_simulator.md", shortened=[("steps=100", "steps=5")]
     )
-    assert "20 steps of mujoco_quadrotor with convex" in quadrotor
+    assert "5 steps of mujoco_quadrotor with convex" in quadrotor
     assert "flight.gif" in filmed
     assert abs(names["flown"].rollout.states[-20:] - [1.0, 0.0, 0.0]).max() < 0.05
     assert "5 steps of gymnasium with convex" in flown
