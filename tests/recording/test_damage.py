@@ -6,6 +6,7 @@ import struct
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,20 +27,21 @@ def recorded(tmp_path_factory):
     return path, runs.record_run(path, steps=20, config=20 * "seed: 7\n")
 
 
-def check_study(path, seed, count):
-    halves = [
+def check_study(path, seed, count, processes=1):
+    ends = [count * i // processes for i in range(processes + 1)]
+    parts = [
         subprocess.Popen(
             [sys.executable, str(STUDY), str(path), *map(str, (seed, *span))],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
         )
-        for span in ((0, count // 2), (count // 2, count))
+        for span in pairwise(ends)
     ]
     lines = []
-    for half in halves:
-        output, errors = half.communicate()
-        assert half.returncode == 0, errors[-2000:]
+    for part in parts:
+        output, errors = part.communicate()
+        assert part.returncode == 0, errors[-2000:]
         lines += [json.loads(line) for line in output.splitlines()]
     assert len(lines) == count
     edits = {kind.__name__ for kind in damage.EDITS}
@@ -71,7 +73,7 @@ def test_a_damaged_recording_is_never_believed_and_does_no_harm(recorded):
 
 @pytest.mark.slow
 def test_three_thousand_damaged_recordings_are_never_believed(recorded):
-    check_study(recorded[0], 1, 3000)
+    check_study(recorded[0], 1, 3000, processes=2)
 
 
 @pytest.mark.parametrize("seed", range(3))
