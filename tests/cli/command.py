@@ -9,9 +9,11 @@ import subprocess
 import sys
 import tempfile
 from contextlib import redirect_stderr, redirect_stdout
+from multiprocessing import forkserver
 from pathlib import Path
 from unittest import mock
 
+ROOT = Path(__file__).resolve().parents[2]
 PATH = str(Path(sys.executable).with_name("gpmpc"))
 IMPORTED = [
     "torch",
@@ -28,14 +30,23 @@ IMPORTED += [
     "gpmpc.experiments.tables",
 ]
 IMPORTED += ["gpmpc.studies.report", "gpmpc.studies.flight", "gpmpc.plotting._recorded"]
-IMPORTED += ["tests.cli.numba_registries"]  # found where the suite starts in its folder
+IMPORTED += ["tests.cli.numba_registries"]
 SECONDS = 300  # a command may take
 ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)  # what it listens to
 
 _copies = multiprocessing.get_context("forkserver")
 _copies.set_forkserver_preload(IMPORTED)
-#: ``multiprocessing.Process``, as a copy of one that has imported everything
-copied_process = _copies.Process
+
+
+def copied_process(target, args):
+    """Returns a process that will be a copy of one that has imported everything."""
+    folder = os.getcwd()
+    os.chdir(ROOT)  # where the original finds the tests' modules as it starts
+    try:
+        forkserver.ensure_running()
+    finally:
+        os.chdir(folder)
+    return _copies.Process(target=target, args=args)
 
 
 def gpmpc(*arguments, cwd, **environment):

@@ -227,7 +227,7 @@ def test_learn_writes_its_three_files_and_names_mistakes(tmp_path):
     import yaml
 
     example = runpy.run_path(str(ROOT / "examples" / "own_log.py"))
-    for number, flight in enumerate(example["simulate_flights"](2, 250)):
+    for number, flight in enumerate(example["simulate_flights"](2, 150)):
         flight.to_csv(tmp_path / f"{number}.csv", index=False)
     (tmp_path / "map.yaml").write_text(
         yaml.safe_dump(example["MAPPING"], sort_keys=False)
@@ -259,15 +259,6 @@ def test_learn_writes_its_three_files_and_names_mistakes(tmp_path):
     card = (tmp_path / "learned" / "card.md").read_text()
     assert "What must not be trusted" in card
     assert "| thrust |" in card
-    progress = tmp_path / "learned" / "progress.json"
-    stored = json.loads(progress.read_text())
-    stages = dict.fromkeys(stored["stages"], "of another version")
-    progress.write_text(json.dumps({"fingerprint": "0", "stages": stages}))
-    anew = forked("learn", *arguments, cwd=tmp_path)
-    assert anew.returncode == 0, anew.stderr
-    assert "learned anew" not in result.stdout
-    assert "learned/progress.json: is of other code of gpmpc than this" in anew.stdout
-    assert json.loads(progress.read_text()) == stored
     wrong = forked(
         "learn", "map.yaml", "0.csv", "1.csv", "--held-out", "7", cwd=tmp_path
     )
@@ -290,11 +281,31 @@ def test_documents_of_somebody_else_are_left_alone(tmp_path):
     assert page.read_text() == "mine"
 
 
+def write_short_run(folder, rows):
+    """Writes a file of rows without sense, and its mapping."""
+    lines = [f"{0.1 * k},{k % 7},{k % 5}" for k in range(rows)]
+    (folder / "short.csv").write_text("\n".join(["t,x,u", *lines, ""]))
+    (folder / "map.yaml").write_text("time: t\nstates: {x: [x]}\ninputs: {u: [u]}")
+
+
+def test_stages_of_other_code_are_gone_through_again(tmp_path):
+    write_short_run(tmp_path, rows=60)
+    arguments = ["learn", "map.yaml", "short.csv", "--points", "10"]
+    result = forked(*arguments, cwd=tmp_path)
+    assert result.returncode in (0, 3), result.stderr
+    assert "learned anew" not in result.stdout
+    progress = tmp_path / "learned" / "progress.json"
+    stored = json.loads(progress.read_text())
+    stages = dict.fromkeys(stored["stages"], "of another version")
+    progress.write_text(json.dumps({"fingerprint": "0", "stages": stages}))
+    anew = forked(*arguments, cwd=tmp_path)
+    assert anew.returncode == result.returncode, anew.stderr
+    assert "learned/progress.json: is of other code of gpmpc than this" in anew.stdout
+    assert json.loads(progress.read_text()) == stored
+
+
 def test_runs_that_are_too_short_to_judge_on_are_refused_first(tmp_path):
-    rows = [f"{0.1 * k},{k % 7},{k % 5}" for k in range(60)]
-    short = tmp_path / "short.csv"
-    short.write_text("\n".join(["t,x,u", *rows[:50], ""]))
-    (tmp_path / "map.yaml").write_text("time: t\nstates: {x: [x]}\ninputs: {u: [u]}")
+    write_short_run(tmp_path, rows=50)
     result = forked("learn", "map.yaml", "short.csv", cwd=tmp_path)
     expected = (
         "gpmpc: learning needs 54 rows without a gap; the longest piece to learn from "
@@ -303,7 +314,7 @@ def test_runs_that_are_too_short_to_judge_on_are_refused_first(tmp_path):
     assert (result.returncode, result.stderr) == (2, expected)
     assert not (tmp_path / "learned").exists()
     # A few rows more are learned from, and judged as far ahead as they tell.
-    short.write_text("\n".join(["t,x,u", *rows, ""]))
+    write_short_run(tmp_path, rows=60)
     result = forked("learn", "map.yaml", "short.csv", "--for-control", cwd=tmp_path)
     assert result.returncode in (0, 3), result.stderr
     assert "short log: rollouts of 2 steps decide, not of 50" in result.stdout
