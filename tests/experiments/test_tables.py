@@ -115,14 +115,15 @@ def test_draws_have_their_own_seed_and_subset(
 
 def test_a_seed_gives_the_same_numbers_with_any_workers(finished, tmp_path):
     _, _, records = finished
-    again = tables(workers=2)
+    again = tables(workers=2, draws=1)
     repeated = run_study(
         again.run_trial,
         again.trials(),
         TrialStore(tmp_path / "trials.jsonl"),
         again.workers,
     )
-    assert without_times(repeated) == without_times(records)
+    first_draws = [record for record in records if record["draw"] == 0]
+    assert without_times(repeated) == without_times(first_draws)
     assert tables(seed=1).trials()[0].seed != again.trials()[0].seed
 
 
@@ -130,9 +131,9 @@ def test_a_run_goes_on_from_finished_fits_past_a_torn_line(finished, tmp_path):
     experiment, store, records = finished
     lines = store.path.read_text().splitlines(keepends=True)
     torn = tmp_path / "trials.jsonl"
-    torn.write_text("".join(lines[:3]) + lines[3][: len(lines[3]) // 2])
+    torn.write_text("".join(lines[:6]) + lines[6][: len(lines[6]) // 2])
     resumed = TrialStore(torn)
-    assert len(resumed.records) == 3
+    assert len(resumed.records) == 6
     known = set(resumed.records)
     called = []
     repeated = run_study(

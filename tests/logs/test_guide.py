@@ -19,14 +19,14 @@ def blocks(language):
 
 def test_the_guide_runs_as_it_stands(tmp_path, monkeypatch, capsys):
     example = runpy.run_path(str(ROOT / "examples" / "own_log.py"))
-    for number, flight in enumerate(example["simulate_flights"](3, 300), start=1):
+    for number, flight in enumerate(example["simulate_flights"](3, 200), start=1):
         flight.to_csv(tmp_path / f"flight_{number}.csv", index=False)
     monkeypatch.chdir(tmp_path)
     names = {"MAPPING": example["MAPPING"]}
     for block in blocks("python"):
         exec(block, names)
     assert names["fit"].to_rows()[0][0] == "thrust"
-    assert "Log(900 rows, 3 runs" in capsys.readouterr().out
+    assert "Log(600 rows, 3 runs" in capsys.readouterr().out
 
 
 def test_the_commands_and_the_mapping_of_the_guide_exist(tmp_path):
