@@ -3,6 +3,7 @@
 import io
 import json
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
@@ -12,6 +13,7 @@ from gpmpc.gp import Trainer
 from gpmpc.mpc import Box, Timing
 from gpmpc.simulation import Rollout
 from gpmpc.status import Status
+from gpmpc.studies import report as reporting
 from gpmpc.studies._document import terminal
 from gpmpc.studies._run_folder import PLAN_PREFIX, RunFolder, folder_name, run_header
 from gpmpc.studies.flight import Experiment, Flown, metrics
@@ -116,6 +118,18 @@ def chosen(controller, seed, **more):
 
 def add(tree, controller, seed, error, **how):
     made_up_run(tree, *chosen(controller, seed), result=metrics_of(error, **how))
+
+
+def undrawn(report, *comparison):
+    """A report without its figures, which take their time."""
+    with patch.object(reporting, "_figures", return_value={}):
+        return report_document(report, *comparison)
+
+
+def texts(report, *comparison):
+    """Every text of a report, by the name of its file."""
+    document = undrawn(report, *comparison)
+    return document.files("report") | {"report.html": document.html()}
 
 
 def documents(report, comparison=()):

@@ -9,8 +9,8 @@ import pytest
 from gpmpc.studies import _index
 from gpmpc.studies._index import INDEX, RunIndex
 from gpmpc.studies._run_folder import PLAN_PREFIX
-from gpmpc.studies.report import read_report, report_document
-from tests.studies.made_up import chosen, made_up_run, metrics_of
+from gpmpc.studies.report import read_report
+from tests.studies.made_up import chosen, made_up_run, metrics_of, undrawn
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def tree(template, tmp_path):
 
 
 def files(tree):
-    document = report_document(read_report(tree))
+    document = undrawn(read_report(tree))
     made = [
         line for line in document.markdown().splitlines() if "Report made" not in line
     ]

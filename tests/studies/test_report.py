@@ -39,6 +39,8 @@ from tests.studies.made_up import (
     metrics_of,
     plan,
     record_of,
+    texts,
+    undrawn,
 )
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -252,7 +254,7 @@ def test_an_unreadable_run_is_named_and_the_others_reported(tree):
             line.startswith(f"{path}: is not what a run writes") and reason in line
             for line in report.skipped
         )
-    written = documents(report)
+    written = texts(report)
     for name in ("report.md", "report.html"):
         assert "2 skipped" in written[name]
         assert str(old) in written[name]
@@ -285,7 +287,7 @@ def test_an_unreadable_run_is_not_missing_nor_flown_over(tmp_path):
     assert report.commands() == [
         f"gpmpc run -m controller=lqr seed=3 folder={tmp_path}"
     ]
-    written = documents(report)
+    written = texts(report)
     assert (
         "6 finished in 2 cells, 0 failed, 1 missing, 1 skipped" in written["report.md"]
     )
@@ -316,7 +318,7 @@ def test_a_line_of_the_latex_table_never_begins_with_a_bracket(tmp_path):
     for steps in ("[1,2]", "[1]"):
         choices, settings = chosen("lqr", 0, steps=steps)
         made_up_run(tmp_path, choices, settings, result=metrics_of(0.1))
-    lines = documents(read_report(tmp_path))["report.tex"].splitlines()
+    lines = texts(read_report(tmp_path))["report.tex"].splitlines()
     assert any(line.startswith("{}[1,2] &") for line in lines)
     assert not any(line.lstrip().startswith("[") for line in lines)
 
@@ -402,7 +404,7 @@ def test_errors_of_both_subsystems_stay_in_their_own_units(tmp_path):
                     result=metrics_of(0.1 + 0.01 * seed) | {"unit": unit},
                 )
     report = read_report(tmp_path)
-    assert "RMSE [m or rad]" in documents(report)["report.md"]
+    assert "RMSE [m or rad]" in texts(report)["report.md"]
     with pytest.raises(
         SettingError,
         match="errors in m and in rad have no common mean; compare runs",
@@ -497,7 +499,7 @@ def test_a_page_says_what_made_the_runs_and_links_them(tree):
         tree, ["controller=nmpc", "horizon=5"], settings, result=metrics_of(0.1)
     )
     report = read_report(tree)
-    html = documents(report)["report.html"]
+    html = texts(report)["report.html"]
     links = re.findall(r'href="([^"]*)"', html)
     assert len(links) == len(report.ended) == 16
     assert all((tree / "report" / unquote(link)).resolve().is_dir() for link in links)
@@ -541,7 +543,7 @@ def test_no_size_means_all_rows(tmp_path):
         made_up_run(tmp_path, choices, settings, result=metrics_of(0.1))
     report = read_report(tmp_path)
     assert report.variables == ("data.size",)
-    html = documents(report)["report.html"]
+    html = texts(report)["report.html"]
     assert re.search(r"<td[^>]*>all</td>", html)
     assert not re.search(r"<td[^>]*>null</td>", html)
 
@@ -567,7 +569,7 @@ def test_a_setting_that_is_left_out_is_a_choice(tmp_path):
     plan(tmp_path / "tree", [["seed=0", "~noise"], ["seed=1", "~noise"]])
     report = read_report(tmp_path / "tree")
     assert (report.runs.state == "finished").sum() == 2
-    assert "left out" in report_document(report).markdown()
+    assert "left out" in undrawn(report).markdown()
     (command,) = report.commands()
     assert command.endswith(f"'~noise' seed=1 folder={tmp_path / 'tree'}")
 
@@ -613,7 +615,7 @@ def test_runs_of_one_cell_that_have_other_settings_are_told(tmp_path):
     line = "runs of one cell differ in what nobody chose on the command line, and "
     line += "their median is of different studies: steps (100 of 3, 200 of 2)"
     assert notes(report) == {"Mixed settings": [line]}
-    assert line in documents(report)["report.md"]
+    assert line in texts(report)["report.md"]
 
 
 @pytest.mark.parametrize(
@@ -656,7 +658,7 @@ def test_errors_of_different_units_are_in_no_common_number(tmp_path, monkeypatch
     report = read_report(tmp_path)
     assert report.variables == ("gain", "system", "unit")
     assert all(len({*cell.unit}) == 1 for cell in cells(report))
-    lines = report_document(report).csv().splitlines()
+    lines = undrawn(report).csv().splitlines()
     assert lines[0].startswith("gain,system,unit,finished")
     series = []
     monkeypatch.setattr(

@@ -3,7 +3,7 @@
 import pytest
 
 from gpmpc.studies.report import read_report, terminal_table
-from tests.studies.made_up import documents, made_up_run, metrics_of, on_terminal
+from tests.studies.made_up import made_up_run, metrics_of, on_terminal, texts
 
 SETTINGS = {
     "data": {"size": None},
@@ -25,11 +25,11 @@ def test_failed_solves_have_a_column_if_any_run_has_some(failing, tmp_path):
             )
     report = read_report(tmp_path)
     header = " ".join(terminal_table(report).header)
-    for words in (header, documents(report)["report.tex"]):
+    for words in (header, texts(report)["report.tex"]):
         assert ("failed" in words) == bool(failing)
         assert "RMSE" in words
         assert "outside" not in words
-    assert "outside" in documents(report)["report.csv"]  # which has room for everything
+    assert "outside" in texts(report)["report.csv"]  # which has room for everything
 
 
 def test_runs_that_differ_in_much_have_one_column_of_what_was_typed(tmp_path):
@@ -54,8 +54,8 @@ def test_a_comparison_stands_in_the_page_and_in_the_text(tmp_path):
     report = read_report(tmp_path)
     lines = ["first line of it", "second line of it"]
     for name in ("report.md", "report.html"):
-        with_it = documents(report, lines)[name]
-        without = documents(report)[name]
+        with_it = texts(report, lines)[name]
+        without = texts(report)[name]
         assert all(
             line in with_it and line not in without for line in [*lines, "Comparison"]
         )

@@ -5,7 +5,6 @@ import io
 import json
 import re
 from itertools import product
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from gpmpc.studies import report as reporting
 from gpmpc.studies.report import (
     compare,
     read_report,
-    report_document,
     sentences,
     terminal_table,
 )
@@ -28,6 +26,7 @@ from tests.studies.made_up import (
     metrics_of,
     on_terminal,
     plan,
+    undrawn,
 )
 
 RESULT = (
@@ -42,11 +41,6 @@ RESULT = (
 
 def states(report, state):
     return (report.runs.state == state).sum()
-
-
-def undrawn(report, *comparison):
-    with patch.object(reporting, "_figures", return_value={}):
-        return report_document(report, *comparison)
 
 
 def written_of(report):
