@@ -83,6 +83,16 @@ def forked(*arguments, cwd, **environment):
         )
 
 
+def begun(*arguments, cwd):
+    """Returns a started copy that runs the command and shows nothing."""
+    streams = (os.devnull, os.devnull)
+    process = copied_process(
+        target=_answer, args=(arguments, cwd, {**os.environ}, streams)
+    )
+    process.start()
+    return process
+
+
 def _answer(arguments, cwd, environment, streams):
     for path, number in zip(streams, (1, 2), strict=True):
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), number)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gpmpc.recording import read_run, replay
-from tests.cli.command import forked, gpmpc, start
+from tests.cli.command import begun, forked, gpmpc, start
 
 TINY = ["data.samples=25", "model.restarts=0", "steps=3", "horizon=1"]
 SWEPT = ["run", "-m", *TINY, "data.size=10,20", "seed=range(2)"]
@@ -465,8 +465,10 @@ def test_a_sweep_and_a_report_count_the_runs_of_other_code(sweep, tmp_path):
 
 
 def test_two_sweeps_share_a_tree(sweep, tmp_path):
-    both = [start(*SWEPT, "folder=tree", cwd=tmp_path) for _ in range(2)]
-    assert [process.wait(timeout=240) for process in both] == [0, 0]
+    both = [begun(*SWEPT, "folder=tree", cwd=tmp_path) for _ in range(2)]
+    for process in both:
+        process.join(240)
+    assert [process.exitcode for process in both] == [0, 0]
     assert results(tmp_path / "tree") == sweep[1]
 
 

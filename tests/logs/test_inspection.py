@@ -227,7 +227,7 @@ def test_learn_writes_its_three_files_and_names_mistakes(tmp_path):
     import yaml
 
     example = runpy.run_path(str(ROOT / "examples" / "own_log.py"))
-    for number, flight in enumerate(example["simulate_flights"](2, 150)):
+    for number, flight in enumerate(example["simulate_flights"](2, 250)):
         flight.to_csv(tmp_path / f"{number}.csv", index=False)
     (tmp_path / "map.yaml").write_text(
         yaml.safe_dump(example["MAPPING"], sort_keys=False)

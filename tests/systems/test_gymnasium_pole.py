@@ -50,7 +50,7 @@ def flown(seed):
 
 @pytest.mark.parametrize(
     "seed",
-    [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 20))],
+    [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 20))],
 )
 def test_a_pole_learned_from_random_rows_survives_cart_jumps(seed):
     chosen, flight = flown(seed)
