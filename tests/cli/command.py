@@ -62,16 +62,24 @@ def gpmpc(*arguments, cwd, **environment):
     )
 
 
-def forked(*arguments, cwd, **environment):
+def in_this_process(function, jobs, workers=None):
+    """Stands for ``in_processes``, each of which takes seconds to start."""
+    for index, job in enumerate(jobs):
+        yield index, function(job)
+
+
+def forked(*arguments, cwd, trials_here=False, **environment):
     """Runs the command in a copy of a process that has imported everything.
 
     It is the command's entry point with a process, a folder, arguments and streams of
-    its own.
+    its own. The trials of a study are run in it too where ``trials_here`` is true, and
+    else in processes that are started for them.
     """
     with tempfile.TemporaryDirectory() as folder:
         streams = [Path(folder) / name for name in ("out", "err")]
         process = copied_process(
-            target=_answer, args=(arguments, cwd, os.environ | environment, streams)
+            target=_answer,
+            args=(arguments, cwd, os.environ | environment, streams, trials_here),
         )
         process.start()
         process.join(SECONDS)
@@ -93,7 +101,7 @@ def begun(*arguments, cwd):
     return process
 
 
-def _answer(arguments, cwd, environment, streams):
+def _answer(arguments, cwd, environment, streams, trials_here=False):
     for path, number in zip(streams, (1, 2), strict=True):
         os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT), number)
     os.environ.clear()
@@ -102,6 +110,10 @@ def _answer(arguments, cwd, environment, streams):
     sys.argv = [PATH, *arguments]
     from gpmpc.cli import main
 
+    if trials_here:
+        from gpmpc.studies import study
+
+        study.in_processes = in_this_process
     main()  # multiprocessing gives exit codes and tracebacks as any process does
 
 

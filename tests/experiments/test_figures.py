@@ -86,7 +86,7 @@ def test_a_run_goes_on_where_it_stopped(finished):
     lines = flights.read_text().splitlines()
     flights.write_text("\n".join(lines[:-3]) + '\n{"fingerprint": "cut sho')
     before = {json.loads(line)["fingerprint"] for line in lines}
-    again = forked("figures", *TINY, cwd=folder)
+    again = forked("figures", *TINY, cwd=folder, trials_here=True)
     assert again.returncode == 0, again.stderr
     after = [line for line in flights.read_text().splitlines() if line.endswith("}")]
     assert {json.loads(line)["fingerprint"] for line in after} == before
@@ -169,6 +169,7 @@ def test_one_subsystem_alone_is_flown_and_drawn(subsystem, tmp_path):
         "loop=model",
         *left_out,
         cwd=tmp_path,
+        trials_here=True,
     )
     assert run.returncode == 0, run.stderr
     rows = list(csv.DictReader((tmp_path / "out/figures.csv").read_text().splitlines()))
@@ -229,7 +230,7 @@ def test_bounds_are_counted_over_all_and_over_bounded_steps(tmp_path):
         "rows.convex.confidence=[0.9,0.99]",
         "state_bounds.lorenz.upper=[-1,null,4,null,null,null]",
     ]
-    run = forked("figures", *TINY, *bounded, cwd=tmp_path)
+    run = forked("figures", *TINY, *bounded, cwd=tmp_path, trials_here=True)
     assert run.returncode == 0, run.stderr
     assert "State bounds that may be broken" in run.stdout
     assert (tmp_path / "out/confidence.png").exists()

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -22,8 +23,10 @@ from gpmpc.experiments.quality import (
 from gpmpc.metrics import tracking_cost
 from gpmpc.mpc import GPMPC, Box, Problem, Tracking
 from gpmpc.propagation import Linearization
+from gpmpc.studies import study as studied
 from gpmpc.studies.study import TrialStore, run_study
 from gpmpc.trajectories import Elliptical
+from tests.cli.command import in_this_process
 from tests.systems.experiments import experiment
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -126,9 +129,10 @@ def rows(tmp_path_factory):
     folder = tmp_path_factory.mktemp("quality")
     trials = study.trials(folder)
     assert len({trial.fingerprint for trial in trials}) == len(trials) == 12
-    records = run_study(
-        study.run_trial, trials, TrialStore(folder / "trials.jsonl"), workers=1
-    )
+    with patch.object(studied, "in_processes", in_this_process):
+        records = run_study(
+            study.run_trial, trials, TrialStore(folder / "trials.jsonl")
+        )
     # A lost flight is a result, which is kept like any other.
     assert len(TrialStore(folder / "trials.jsonl").records) == 12
     document = study.document(records)

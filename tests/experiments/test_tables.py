@@ -9,6 +9,7 @@ from dataclasses import replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -31,6 +32,7 @@ from gpmpc.gp import SoftLimits, Transitions, identity, train
 from gpmpc.studies import study
 from gpmpc.studies.study import TrialStore, run_study
 from gpmpc.trajectories import Hover
+from tests.cli.command import in_this_process
 from tests.studies.made_up import shown_number
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -72,17 +74,17 @@ def without_times(records):
     ]
 
 
+def run_here(experiment, store, *progress):
+    """Returns the records of trials that are run in this process."""
+    with patch.object(study, "in_processes", in_this_process):
+        return run_study(experiment.run_trial, experiment.trials(), store, 1, *progress)
+
+
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     store = TrialStore(tmp_path_factory.mktemp("tables") / "trials.jsonl")
     experiment = tables()
-    return (
-        experiment,
-        store,
-        run_study(
-            experiment.run_trial, experiment.trials(), store, workers=experiment.workers
-        ),
-    )
+    return experiment, store, run_here(experiment, store)
 
 
 def test_there_is_one_record_a_draw_with_every_measure(finished):
@@ -136,9 +138,7 @@ def test_a_run_goes_on_from_finished_fits_past_a_torn_line(finished, tmp_path):
     assert len(resumed.records) == 6
     known = set(resumed.records)
     called = []
-    repeated = run_study(
-        experiment.run_trial, experiment.trials(), resumed, 1, called.append
-    )
+    repeated = run_here(experiment, resumed, called.append)
     assert without_times(repeated) == without_times(records)
     assert len(called) == len(records)
     assert [store.records[f] for f in known] == [
@@ -171,12 +171,7 @@ def failing(transitions, seed):
 
 def test_a_failed_fit_is_counted_and_does_not_stop_the_others(tmp_path):
     experiment = tables(model=failing)
-    records = run_study(
-        experiment.run_trial,
-        experiment.trials(),
-        TrialStore(tmp_path / "trials.jsonl"),
-        workers=experiment.workers,
-    )
+    records = run_here(experiment, TrialStore(tmp_path / "trials.jsonl"))
     assert [record["error"] for record in records] == ["no start led anywhere"] * 8
     rows = summarise(records)
     assert [row.failed for row in rows] == [2, 2, 2, 2]
