@@ -56,14 +56,20 @@ def test_an_interrupt_between_two_starts_ends_the_first_worker(monkeypatch):
 
 def test_ctrl_c_ends_everything_at_once(tmp_path):
     (tmp_path / "slow_trial.py").write_text(
-        "import time\ndef slow(seed):\n    time.sleep(60)\n"
+        "import time\ndef slow(seed):\n"
+        "    open(f'begun {seed}', 'w').close()\n    time.sleep(60)\n"
     )
     program = """
         import multiprocessing, os, signal, threading, time
+        from glob import glob
         from slow_trial import slow
         from gpmpc.parallel import in_processes
+        def interrupt():
+            while len(glob("begun *")) < 2:
+                time.sleep(0.05)
+            os.kill(os.getpid(), signal.SIGINT)
         if __name__ == "__main__":
-            threading.Timer(3.0, os.kill, [os.getpid(), signal.SIGINT]).start()
+            threading.Thread(target=interrupt).start()
             try:
                 list(in_processes(slow, range(4), 2))
             except KeyboardInterrupt:
