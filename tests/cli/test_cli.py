@@ -211,6 +211,7 @@ def small_run(tmp_path_factory):
         "data.samples=12",
         "trajectory=elliptical",
         "model.restarts=0",
+        "workers=1",
     ]
     return cwd, arguments, forked(*arguments, cwd=cwd)
 
