@@ -79,7 +79,7 @@ def dropped(gp, new, points):
     return torch.nonzero(~stays)[:, 0].tolist()
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(8))
 def test_the_point_whose_loss_changes_least_is_dropped(seed):
     data = transitions(7, seed)
     gp = posterior(data[:6], noise=[1e-4, 1e-2, 1.0][seed % 3])
