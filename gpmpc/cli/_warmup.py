@@ -10,6 +10,7 @@ from gpmpc.cli._commands import Result
 from gpmpc.cli._experiment import experiment_of
 from gpmpc.cli._settings import compose, settings_folders
 from gpmpc.cli._terminal import progress_bar
+from gpmpc.mpc._control_step import rare_kernels_loaded
 from gpmpc.studies.flight import run_trial
 
 _CONTROLLERS = (
@@ -25,7 +26,12 @@ def warmup(arguments: argparse.Namespace) -> Result:
     """Flies two steps with every controller, and prints how long that took."""
     console = Console()
     began = time.perf_counter()
-    with progress_bar(console) as bar, report_compilation(), settings_folders():
+    with (
+        progress_bar(console) as bar,
+        report_compilation(),
+        settings_folders(),
+        rare_kernels_loaded(),
+    ):
         task = bar.add_task("", total=len(_CONTROLLERS))
         for controller in _CONTROLLERS:
             bar.update(task, description=f"compiling what {controller} needs")

@@ -5,14 +5,16 @@ leads to the next plan. ``ControlStep.run`` is the loop.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 from time import perf_counter
 from typing import NamedTuple
 
 import numpy as np
 
-from gpmpc.mpc._condense import condense
+from gpmpc.mpc._condense import condense, condense_with_feedback
 from gpmpc.mpc._controller import FEASIBLE, KEPT, Decision, Request, Timing
 from gpmpc.mpc._cost import FunctionNotFinite
 from gpmpc.mpc._linear_quadratic import CondensedProgram, Plan
@@ -23,6 +25,23 @@ from gpmpc.mpc._roll_out import MISS_RATIO, close_defects
 from gpmpc.mpc._sqp import FAILURES, Globalization, Iterate, measure_continuity
 from gpmpc.qp import QPSolution, QPSolver, QuadraticProgram
 from gpmpc.status import Status
+
+_loads_rare_kernels = ContextVar("_loads_rare_kernels", default=False)
+
+
+@contextmanager
+def rare_kernels_loaded() -> Iterator[None]:
+    """Lets decisions inside load the kernels, too, that few programs need.
+
+    Else the first decision of an unstable plan waits for them, ten seconds or more
+    where they are not compiled yet.
+    """
+    before = _loads_rare_kernels.set(True)
+    try:
+        yield
+    finally:
+        _loads_rare_kernels.reset(before)
+
 
 Array = np.ndarray
 
@@ -194,12 +213,19 @@ class ControlStep:
 
     def _condense(self, local: LocalProblem) -> CondensedProgram:
         """Returns the quadratic program in the inputs."""
+        bounds = self._prediction.program_bounds
+        start = local.plan.states[0]
+        references = self._request.references
+        if _loads_rare_kernels.get():
+            condense_with_feedback.unchecked(
+                local.cost, bounds, local.stages, start, references, local.rows
+            )
         program = condense(
             cost=local.cost,
-            bounds=self._prediction.program_bounds,
+            bounds=bounds,
             stages=local.stages,
-            start=local.plan.states[0],
-            references=self._request.references,
+            start=start,
+            references=references,
             rows=local.rows,
         )
         if self._globalization is not None:

@@ -38,6 +38,7 @@ from gpmpc.exceptions import (
     check_number,
 )
 from gpmpc.gaussian import Gaussian
+from gpmpc.mpc._control_step import rare_kernels_loaded
 from gpmpc.mpc._controller import (
     Controller,
     Decision,
@@ -430,8 +431,9 @@ class ControlLoop:
     def warm_up(self, state: Any, reference: Any, parameters: Any = None) -> None:
         """Decides twice and forgets it: everything is then compiled beforehand."""
         rehearsal = ControlLoop(self.controller, "previous_plan")
-        for _ in range(2):
-            rehearsal.input(state, reference, parameters)
+        with rare_kernels_loaded():
+            for _ in range(2):
+                rehearsal.input(state, reference, parameters)
 
 
 def _state_along(states: np.ndarray, time: float) -> np.ndarray:

@@ -1,4 +1,5 @@
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from gpmpc.mpc import (
     Problem,
     Reference,
     Tracking,
+    _control_step,
 )
 from gpmpc.mpc.baselines import LQR
 from gpmpc.propagation import Linearization
@@ -49,6 +51,18 @@ def test_five_lines_steer_somebody_elses_plant_to_a_set_point():
         x = next_state(x, loop.input(x, GOAL))
     assert np.allclose(x, GOAL, atol=1e-3)
     assert loop.failures == 0
+
+
+def test_a_warm_up_loads_the_kernel_of_unstable_plans(monkeypatch):
+    loads = []
+    kernel = SimpleNamespace(unchecked=lambda *_: loads.append("kernel"))
+    monkeypatch.setattr(_control_step, "condense_with_feedback", kernel)
+    loop = ControlLoop(controller())
+    loop.warm_up(np.zeros(2), GOAL)
+    assert loads
+    loads.clear()
+    loop.input(np.zeros(2), GOAL)
+    assert not loads
 
 
 @pytest.mark.parametrize("on_failure", ["previous_plan", "hold"])
