@@ -24,6 +24,7 @@ from gpmpc.mpc._flight_memory import (
     SATURATED,
     STANDING,
     WELL,
+    WINDOW,
     Alarm,
     rounding_of,
     usual,
@@ -114,14 +115,20 @@ def _follow_way(memory, reference):
 
 @njit_noalloc
 def _squared_noise(memory):
-    """The part of the squared distance that noise and uncertainty make."""
+    """The part of the squared distance that noise and uncertainty make.
+
+    Of a plan far from the data that is noise alone: ignorance excuses no distance.
+    """
+    flight = memory.flight[0]
+    last_plan_was_far = flight.far[(flight.step - 1) % WINDOW] > 0.0
     noise = 0.0
     for e in range(len(memory.weights)):
         weight = memory.weights[e]
         if weight.row == weight.column:
             state = memory.states[weight.row]
             variance = state.model_noise + state.sensor_variance
-            if state.predicted_variance == state.predicted_variance:
+            is_predicted = state.predicted_variance == state.predicted_variance
+            if is_predicted and not last_plan_was_far:
                 variance += state.predicted_variance
             size = rounding_of(_present(state))
             noise += weight.of_stage * (variance + size * size)
@@ -275,11 +282,13 @@ def follow_promise(flight, distance, promise, move):
     if k > 0:  # one wrong measurement costs nothing
         counted_distance = min(counted_distance, flight.distances[(k - 1) % RING])
     flight.paid[slot] = counted_distance * counted_distance
-    flight.allowances[slot] = _allowance(move, h)
-    # The slot still holds what step k - h promised. Noise was not promised, nor what
-    # prepares for a reference that is known later.
+    # The slots still hold what belongs to step k - h. Its plan promised no noise, nor
+    # what prepares for a reference that is known later: of an end that moved just then
+    # it knew a single stage.
     negligible_square = distance.negligible_below * distance.negligible_below
     allowed_cost = flight.promises[slot] + 0.25 * h * negligible_square
+    allowed_cost += flight.allowances[slot]
+    flight.allowances[slot] = _allowance(move, h)
     is_comparable = min(flight.horizon, LONG) == h
     flight.promises[slot] = promise if is_comparable else np.nan
     if k < h or flight.steps_with_change <= FEWEST_CHANGES:  # the noise is not known

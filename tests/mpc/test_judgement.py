@@ -235,11 +235,14 @@ def test_plans_cheaper_than_the_first_do_not_climb():
     assert rising[0].startswith("the plans have stopped falling and rise: they cost 0.")
 
 
-def test_plans_far_from_data_are_suspicious_away_from_the_goal():
+@pytest.mark.parametrize("variance", [0.0, 9.0])
+def test_plans_far_from_data_are_suspicious_away_from_the_goal(variance):
+    """However little the model says that it knows there."""
+    covariances = np.tile(variance * np.eye(2), (6, 1, 1))
     for place, level in ([0.0, "healthy"], [1.0, "suspicious"]):
         judge = FlightJudge(CONTROLLER.problem)
         x = np.array([place, 0.0])
-        plan = plan_of(x, plan_novelty=0.95)
+        plan = replace(plan_of(x, plan_novelty=0.95), covariances=covariances)
         judged_levels = [judge.judge(x, np.zeros(2), plan).level for _ in range(4)]
         assert judged_levels == ["healthy", "healthy", level, level]
 
@@ -619,6 +622,25 @@ def test_a_goal_that_moves_without_notice_is_no_alarm():
             "healthy"
         )
         x = goal + 0.5 * (x - goal)
+
+
+def test_preparing_for_a_jump_whose_length_no_plan_knew_is_no_alarm():
+    """A plan that sees one stage behind a jump does not move yet; later ones do."""
+    steps = np.arange(120)
+    goals = (steps >= 60).astype(float)
+    places = (0.05 * (steps - 45)).clip(0.0, 1.0)
+    judge = FlightJudge(CONTROLLER.problem)
+    for k in range(60):
+        rows = slice(k, k + 26)
+        means = np.zeros((26, 2))
+        if k > 35:
+            means[:, 0] = places[rows]
+        plan = replace(
+            plan_of(np.zeros(2)), means=means, covariances=np.zeros((26, 2, 2))
+        )
+        measured = np.array([places[k], 0.001 * (-1.0) ** k])
+        references = np.column_stack([goals[rows], np.zeros(26)])
+        assert judge.judge(measured, references, plan).level == "healthy", k
 
 
 def test_a_goal_that_moves_away_from_a_dead_plant_is_suspicious():
