@@ -48,7 +48,7 @@ def train_output_gp(
         log.mapping.column_names("inputs"), log.mapping.column_names("context")
     )
     if sees_memory:
-        names = [f"regressor {i + 1}" for i in range(features.shape[1])]
+        names = model.memory.regressor_names(names, model.kinematics.output_names)
     columns = ColumnDescriptions(
         features=names,
         outputs=[model.kinematics.output_names[output] for output in outputs],

@@ -16,6 +16,7 @@ and Billings, 1985). Their factors are clipped to the ranges of the data, so tha
 outside of them nothing grows but what is linear.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations_with_replacement
@@ -231,6 +232,27 @@ class Memory:
             columns.append(self.products(self._factors(features, memory)))
         columns.append(np.ones((*memory.shape[:-1], 1)))
         return np.concatenate(columns, axis=-1)
+
+    def regressor_names(
+        self, features: Sequence[str], outputs: Sequence[str]
+    ) -> list[str]:
+        """Names the regressors but for the last one, by the names of what they are of.
+
+        >>> Memory(rows=2).regressor_names(["angle"], ["d_angle"])
+        ['angle', 'change of angle over 1 row', 'change of angle over 2 rows']
+        """
+        spans = ["1 row", *(f"{row} rows" for row in range(2, self.rows + 1))]
+        names = [*features]
+        for span in spans[: self.rows]:
+            names += [f"change of {name} over {span}" for name in features]
+        for decay in self.decays:
+            rows = round(1 / (1 - decay))
+            names += [f"{name} less its mean over {rows} rows" for name in features]
+        for decay in self.output_decays:
+            rows = round(1 / (1 - decay))
+            names += [f"mean of {name} over {rows} rows" for name in outputs]
+        products = 0 if self.products is None else len(self.products.factors)
+        return names + [f"product {number + 1}" for number in range(products)]
 
     def product_slopes(self, features: Array, memory: Array) -> tuple[Array, Array]:
         """Computes the derivatives of the products, where the memory has some.

@@ -167,6 +167,18 @@ def test_a_memory_takes_the_place_of_a_disturbance():
     )
 
 
+def test_each_regressor_of_a_memory_has_a_name():
+    memory = Memory(rows=2, decays=(0.9,), output_decays=(0.8,))
+    names = memory.regressor_names(["angle", "torque"], ["d_angle"])
+    assert names[:3] == ["angle", "torque", "change of angle over 1 row"]
+    assert names[-2:] == [
+        "torque less its mean over 10 rows",
+        "mean of d_angle over 5 rows",
+    ]
+    remembered = np.zeros(memory.dim(2, 1))
+    assert len(names) == len(memory.regressors(np.zeros(2), remembered)) - 1
+
+
 def test_a_structure_has_the_same_penalties_in_every_fold():
     log = tanks(0, rows=320, noise=0.0)
     folds = split_folds(log, past=10, steps=20)
