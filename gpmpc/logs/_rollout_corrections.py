@@ -41,6 +41,8 @@ _PRIORS = tuple(
     Prior(penalty, movement)
     for penalty in (np.inf, 10.0, 1.0, 0.1, PENALTY, 0.001)
     for movement in (1.0, 0.5, 0.0)
+) + tuple(  # where stretches differ, the wildest one decides what is least squared
+    Prior(PENALTY, movement, absolute=True) for movement in (1.0, 0.0)
 )
 _ROLLOUT = _PRIORS.index(Prior(np.inf, 1.0))  # as it is
 _RIDGE = _PRIORS.index(Prior(PENALTY, 0.0))  # the ridge regression without a model

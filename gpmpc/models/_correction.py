@@ -16,6 +16,8 @@ its movement, or none of it, which is the start. The coefficients of the movemen
 those of the prior: as good as the movement is on some runs, on faster ones it may be
 worse, and what is fitted to it is no longer the ridge regression. Corrections with
 different priors and penalties predict best together: their coefficients are averaged.
+So are those of least squares and of least absolute errors: where most rows are calm and
+others wild, as of a tank that runs over, the squares are those of the wild ones.
 """
 
 from collections.abc import Sequence
@@ -33,6 +35,9 @@ from gpmpc.models._windows import Windows
 ROWS_SEEN = (1, 2, 3, 5, 8, 12, 20)  # of the past, counted back from the start
 BINS = 5  # means of the inputs to come that a correction sees
 PENALTY = 0.01  # of squared coefficients of standardised columns, per row
+_REWEIGHTINGS = 4  # of rows, towards least absolute errors
+_LEAST_ERROR = 0.1  # of the median one: smaller ones have no more weight
+_MOST_ENTRIES = 8  # of the errors whose rows are weighted, each for itself
 
 
 class Prior(NamedTuple):
@@ -40,6 +45,9 @@ class Prior(NamedTuple):
 
     penalty: float  #: of squared deviations from it, per row; infinite: it is taken
     movement: float = 1.0  #: share of the predicted movement that it keeps
+    #: whether the mean absolute error is least, where errors have few entries; else it
+    #: is the squared one, which the rows of the largest errors decide
+    absolute: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +213,8 @@ class _Moments(NamedTuple):
     deviation: Array  # likewise
     normal: Array  # z^T z of the standardised regressors (1 + r, 1 + r)
     with_errors: Array  # z^T e (1 + r, e)
-    rows: int  # W
+    z: Array  # (W, 1 + r)
+    errors: Array  # (W, e)
 
 
 def _moments(
@@ -224,7 +233,7 @@ def _moments(
     deviation = np.where(at_rest, 1.0, regressors.std(axis=0))
     z = _standardized(regressors, mean, deviation)
     errors = windows.space.difference(measured, predicted)
-    return _Moments(mean, deviation, z.T @ z, z.T @ errors, len(z))
+    return _Moments(mean, deviation, z.T @ z, z.T @ errors, z, errors)
 
 
 def _weights(moments: _Moments, prior: Prior) -> Array:
@@ -235,12 +244,44 @@ def _weights(moments: _Moments, prior: Prior) -> Array:
     weights = _expected_weights(moments, prior.movement)
     if np.isinf(prior.penalty):
         return weights
-    fitted = slice(0, len(weights) - weights.shape[1])
+    entries = weights.shape[1]
+    fitted = slice(0, len(weights) - entries)
     is_penalized = np.diag(np.r_[0.0, np.ones(len(moments.mean))])
-    penalized = moments.normal + prior.penalty * moments.rows * is_penalized
+    penalty = (prior.penalty * len(moments.z) * is_penalized)[fitted, fitted]
     missed = moments.with_errors - moments.normal @ weights
-    solution: Any = np.linalg.solve(penalized[fitted, fitted], missed[fitted])
+    normal = moments.normal[fitted, fitted]
+    solution: Any = np.linalg.solve(normal + penalty, missed[fitted])
+    if prior.absolute and entries <= _MOST_ENTRIES:
+        errors = moments.errors - moments.z @ weights
+        z = moments.z[:, fitted]
+        for i in range(entries):
+            solution[:, i] = _least_absolute(z, errors[:, i], penalty, solution[:, i])
     weights[fitted] += solution
+    return weights
+
+
+def _least_absolute(z: Array, errors: Array, penalty: Array, start: Array) -> Array:
+    """Returns weights (r,) whose mean absolute error, about, is least.
+
+    Rows are weighted by the inverse of what they miss, again and again (iteratively
+    reweighted least squares). So the rows of a calm stretch decide as much as those of
+    a wild one.
+
+    Args:
+        z: Regressors (W, r).
+        errors: That they explain (W,).
+        penalty: Of squared weights (r, r).
+        start: Weights of least squares.
+    """
+    weights = start
+    for _ in range(_REWEIGHTINGS):
+        missed = np.abs(errors - z @ weights)
+        least = _LEAST_ERROR * np.median(missed)
+        if not least > 0:  # half of the rows are exact
+            return weights
+        of_rows = 1 / np.maximum(missed, least)
+        weighted = z * (of_rows / of_rows.mean())[:, None]
+        weights = np.linalg.solve(z.T @ weighted + penalty, weighted.T @ errors)
     return weights
 
 

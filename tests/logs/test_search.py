@@ -412,6 +412,33 @@ def test_a_correction_without_movement_is_the_ridge_regression():
     np.testing.assert_allclose(corrected[1], corrected[0], rtol=0, atol=1e-9)
 
 
+def test_least_absolute_errors_are_those_of_most_rows():
+    """Of a tank whose gain is thirty times as large in a fifth of the rows."""
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(size=(1, 1000, 2))
+    states = np.zeros((1, 1000, 2))
+    for k in range(999):
+        gain = 0.1 if k < 800 else 3.0
+        noise = 0.01 * rng.normal(size=2)
+        states[0, k + 1] = 0.8 * states[0, k] + gain * inputs[0, k] + noise
+    log = log_of(states, inputs)
+    windows = log.windows(2, past=20)
+    still = np.repeat(windows.states[:, 20:21], 2, axis=1)
+    squared, absolute = Correction.fit_each(
+        kinematics=Increments(log.space),
+        windows=windows,
+        predicted=still,
+        steps=(1, 2),
+        priors=[Prior(0.001), Prior(0.001, absolute=True)],
+    )
+    of_most_rows = windows[:700]
+    errors = [
+        np.abs(windows.states[:700, 21:] - one(of_most_rows, still[:700])).mean()
+        for one in (squared, absolute)
+    ]
+    assert errors[1] < 0.5 * errors[0]
+
+
 def test_averages_take_what_is_best_on_other_runs():
     log = log_of(
         [np.random.default_rng(i).normal(size=(100, 2)) for i in range(6)],
