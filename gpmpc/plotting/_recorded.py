@@ -234,7 +234,7 @@ def _draw_prediction_error(
 def _noise_in_words(run: "Run") -> str:
     """Returns which noise the tube of a prediction holds."""
     if "noise_std" in run.metadata.get("run", {}):
-        return "noise included"
+        return "the model's noise included"
     return "as planned"
 
 

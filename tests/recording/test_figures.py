@@ -56,6 +56,17 @@ def test_a_prediction_is_of_one_step_and_of_a_plan_that_flew(with_gap):
         assert shown[with_gap.times[row]] == states[row] - means[row - 1]
 
 
+def test_a_tube_says_which_noise_it_holds(with_gap):
+    deviations = " ".join(["0.1"] * len(with_gap.state_names))
+    for about, words in (
+        ({"noise_std": deviations}, "the model's noise included"),
+        ({}, "as planned"),
+    ):
+        figure = tracking_figure(replace(with_gap, metadata={"run": about}))
+        collections = [each for axis in figure.axes for each in axis.collections]
+        assert any(str(each.get_label()).endswith(words) for each in collections)
+
+
 def test_nothing_is_drawn_across_lost_steps(with_gap):
     times = with_gap.times
     for figure, label in (
