@@ -32,7 +32,7 @@ def test_failed_solves_have_a_column_if_any_run_has_some(failing, tmp_path):
     assert "outside" in texts(report)["report.csv"]  # which has room for everything
 
 
-def test_runs_that_differ_in_much_have_one_column_of_what_was_typed(tmp_path):
+def test_runs_that_differ_in_much_have_one_column_of_words(tmp_path):
     typed = [f"data.setting_{i}={i}" for i in range(12)]
     for i in range(12):
         values = {f"setting_{j}": j if i == j else 0.5 for j in range(12)}
