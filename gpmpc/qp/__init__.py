@@ -1,7 +1,9 @@
-"""Quadratic programs and their solvers (NumPy float64).
+"""Quadratic programs and their solvers, in NumPy float64.
 
-Solvers are looked up in their modules at first use: whoever needs a problem or a
-solution only, such as the writer of recordings, loads no compiler.
+``DualActiveSet`` is the default of the controllers, ``PrimalActiveSet`` Algorithm 1 of
+Cao, Lai and Alam (2017), and ``CvxpySolver`` takes any solver of CVXPY. Solvers are
+imported at first use: who needs a problem or a solution only, such as the writer of
+recordings, loads no compiler.
 """
 
 import importlib
