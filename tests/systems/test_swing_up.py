@@ -1,5 +1,5 @@
-"""Pendulum, cart-pole and acrobot swing up from hanging with the settings that their
-files bring."""
+"""Pendulums of one and two links and a cart-pole swing up from hanging with the
+settings that their files bring."""
 
 import numpy as np
 import pytest
@@ -50,6 +50,13 @@ def test_a_cart_pole_swings_up_and_is_where_it_started():
 def test_an_acrobot_swings_up_by_its_elbow_alone():
     _, _, error = flown_up("acrobot")
     assert error < 0.2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("actuated", ["elbow", "shoulder"])
+def test_a_double_pendulum_swings_up_by_either_motor(actuated):
+    _, _, error = flown_up("double_pendulum", f"system.actuated={actuated}")
+    assert error < 0.3
 
 
 def test_the_papers_protocol_keeps_angles_which_can_be_set():
