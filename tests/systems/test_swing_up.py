@@ -53,10 +53,10 @@ def test_an_acrobot_swings_up_by_its_elbow_alone():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("actuated", ["elbow", "shoulder"])
-def test_a_double_pendulum_swings_up_by_either_motor(actuated):
+@pytest.mark.parametrize(("actuated", "most"), [("elbow", 0.35), ("shoulder", 0.01)])
+def test_a_double_pendulum_swings_up_by_either_motor(actuated, most):
     _, _, error = flown_up("double_pendulum", f"system.actuated={actuated}")
-    assert error < 0.3
+    assert error < most
 
 
 def test_the_papers_protocol_keeps_angles_which_can_be_set():
