@@ -18,9 +18,10 @@ estimate of a constant disturbance.
 
 The model with the change and the one without predict each step before they see it: the
 change is used once its log densities, summed over a window of steps, lead by a margin,
-and ceases to be used once they trail. The model's noise is scaled by what successive
-errors differ by, in the median, where that is more. A decision that fails with the
-change is taken without it.
+and ceases to be used once they trail. A decision that fails with the change is taken
+without it. The model's noise is scaled by what successive errors differ by, in the
+median, where that is more; likewise the noise of states that d does not reach, by what
+it leaves of errors.
 
 What is measured may be wrong, and the plant may become another one. So the flight is
 explained in several ways at once, each with its weight (a multiple-hypothesis filter:
@@ -38,10 +39,19 @@ each measurement it may go on in these ways:
 
 Each way multiplies the weight by its likelihood: the density of what the trusted
 sensors show, a broad density for each wrong one (``surprise``), and the prior
-probability of what happened. The heaviest few go on. The controller plans by the
+probability of what happened. Sensors that were wrong before are so more probably. The
+heaviest few go on; without a measurement, as they predict. The controller plans by the
 heaviest one: with its model, from where it says that the plant is. A choice that was
 wrong is corrected by the next measurements, with what it has taught. Mostly nothing is
 odd, and there is one explanation.
+
+What is assumed of sensors: their noise is white; what is wrong of them is wrong by more
+than some four deviations, and in fewer than half of the last nine steps. More often it
+counts as noise, and less is believed, as is an error that grows slowly. One that stays
+the same for some steps is taken for a plant that was moved: the loop then follows what
+is shown. The first five measurements are believed, and always those of a sensor of
+which the model says no noise. Nothing is learned where no two measurements follow each
+other, nor of a measurement that is late what delayed it.
 
 ``_continuations`` weighs the ways to go on, ``_step`` keeps the heaviest and learns,
 ``_changed_model`` is the model f + B d, ``_state`` what one step hands to the next.

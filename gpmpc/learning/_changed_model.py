@@ -22,6 +22,8 @@ from gpmpc.learning._settings import OnlineLearning
 from gpmpc.models import Features
 from gpmpc.models._wrapper import Wrapper
 
+_UNKNOWN_VARIANCE = 1e60  # of what nobody knows
+
 
 class ChangeWindows(NamedTuple):
     """The GPs of the change, and those that will follow when the window is full."""
@@ -116,6 +118,11 @@ class ChangedModel(Wrapper):
         return to_array(self.B)
 
     @cached_property
+    def B_squared(self) -> Array:
+        """Squares of the entries of B (n, k): by these variances of d act on states."""
+        return self.B_array**2
+
+    @cached_property
     def B_inverse(self) -> Array:
         """Pseudo-inverse of B (k, n): the part of an error of f that d can explain."""
         return np.asarray(np.linalg.pinv(self.B_array), dtype=np.float64)
@@ -131,14 +138,26 @@ class ChangedModel(Wrapper):
         """Variances (n,) of what scatters measured states besides the GP's noise.
 
         So do those of positions that follow from a rate, which have no GP of their own.
+        Of a sensor whose noise nobody knows it is so large that nothing is asked.
         """
+        of_gp = self.B_squared @ self.gp_noise
         noise: Tensor | None = getattr(self.model, "observation_noise", None)
         if self.gp is not self.model and noise is None:
             noise = cast(Any, self.model).noise
-        if self.gp is self.model or noise is None:
-            return np.zeros(self.model.state_dim)
-        variances = np.diagonal(to_array(noise))
-        return (variances - self.B_array**2 @ self.gp_noise).clip(0.0)
+        further = np.zeros(self.model.state_dim)
+        if self.gp is not self.model and noise is not None:
+            further = (np.diagonal(to_array(noise)) - of_gp).clip(0.0)
+        return np.where(of_gp + further > 0.0, further, _UNKNOWN_VARIANCE)
+
+    @cached_property
+    def sensor_noise(self) -> Array:
+        """Variances (n,) of the noise of measured states."""
+        return self.B_squared @ self.gp_noise + self.further_noise
+
+    @cached_property
+    def has_unreached_states(self) -> bool:
+        """Whether d cannot explain every error of the model."""
+        return bool(np.linalg.matrix_rank(self.B_array) < len(self.B_array))
 
     @cached_property
     def signal(self) -> Array:

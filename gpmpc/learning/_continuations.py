@@ -21,13 +21,16 @@ _PUSH = -18.0
 _OUTPUTS_APART = -3.0
 # Log prior of each sensor that is wrong, but for the first: they fail one by one.
 _ANOTHER_SENSOR = -5.0
+# Prior probability that a sensor is wrong, to which the share of those adds that were:
+# of so many measurements at least.
+_WRONG_SENSOR = 3e-4
+_FEWEST_MEASUREMENTS = 300
 # Steps for which a new plant does not change again: its first points are still to say
 # how the change depends on state and input.
 _SETTLING_STEPS = 5
 _NEARLY_ZERO = 1e-100  # squared effect of an input
 _INDEPENDENT = 0.01  # part of each deviation that no other sensor knows, at least
 _NEGLIGIBLE = 40.0  # log weight below the heaviest, from which on nothing is kept
-_UNKNOWN_VARIANCE = 1e60  # of what nobody knows
 _HOPELESS = 1e8  # squared error over its variance that double precision compares
 
 
@@ -73,9 +76,11 @@ def forecast(explanation: Explanation, input: Array) -> Forecast:
 
 
 def is_settling(explanation: Explanation) -> bool:
-    """Returns whether the plant has just become another one."""
+    """Returns whether the first points of another plant are being learned."""
     began = explanation.began
-    return began is not None and explanation.model.time - began < _SETTLING_STEPS
+    if began is None or not len(explanation.model):
+        return False
+    return explanation.model.time - began < _SETTLING_STEPS
 
 
 class Continuation(NamedTuple):
@@ -100,9 +105,16 @@ class Continuation(NamedTuple):
         explanation = self.explanation
         return explanation.model.time if self.is_new_plant else explanation.began
 
+    @property
+    def pushed(self) -> float | None:
+        """Time at which the plant was last moved by a push [steps]."""
+        explanation = self.explanation
+        return explanation.model.time if self.is_pushed else explanation.pushed
+
     def says_the_same(self, other: "Continuation") -> bool:
-        """Returns whether plant and wrong sensors are the same by another one."""
-        return self.began == other.began and np.array_equal(self.wrong, other.wrong)
+        """Returns whether plant, push and wrong sensors are the same by another one."""
+        is_same_plant = self.began == other.began and self.pushed == other.pushed
+        return is_same_plant and np.array_equal(self.wrong, other.wrong)
 
 
 class _Hypothesis(NamedTuple):
@@ -126,10 +138,7 @@ def continuations(
     model = explanation.model
     B = model.B_array
     surprise = model.learning.surprise
-    noise = (B * step.noise_variance) @ B.T + np.diag(model.further_noise)
-    # Of a sensor whose noise nobody knows nothing is asked.
-    has_no_noise = np.diagonal(noise) == 0.0
-    noise += np.diag(np.where(has_no_noise, _UNKNOWN_VARIANCE, 0.0))
+    noise = (B * step.noise_variance) @ B.T + np.diag(step.further_noise)
     same_plant = _same_plant(explanation, predicted, step.input, noise)
     expected = same_plant[0].expected
     variance = np.min(
@@ -145,7 +154,7 @@ def continuations(
     if not frozen.any() and (error**2 <= QUIET * variance).all():
         # Nothing asks for another way.
         same_plant = same_plant[-1:]
-        log_outlier = _log_outlier(error, noise, surprise)
+        log_outlier = _log_outlier(error, noise, explanation)
         (_, log_likelihood), *_ = _sensor_sets(
             error, same_plant[0].expected, frozen, log_outlier
         )
@@ -156,7 +165,7 @@ def continuations(
     hypotheses = same_plant + _new_plants(explanation, predicted, noise)
     for expected, log_prior, is_new_plant in hypotheses:
         error = state_difference(step.next_state, expected.mean, model.angles)
-        log_outlier = _log_outlier(error, noise, surprise)
+        log_outlier = _log_outlier(error, noise, explanation)
         for wrong, log_likelihood in _sensor_sets(error, expected, frozen, log_outlier):
             if wrong.any():
                 log_likelihood -= _ANOTHER_SENSOR  # none for the first
@@ -179,21 +188,29 @@ def continuations(
     return found
 
 
-def _log_outlier(error: Array, noise: Array, surprise: float) -> Array:
+def _log_outlier(error: Array, noise: Array, explanation: Explanation) -> Array:
     """Returns the log density of what a wrong sensor shows (n,).
 
     It may be wrong by any order of magnitude. At a squared error of ``surprise`` noise
-    variances it is as probable as a right one.
+    variances it is as probable as a right one; at a smaller one where sensors have been
+    wrong before.
 
     Args:
         error: Measured less expected (n,).
         noise: Covariance of the noise (n, n).
-        surprise: Of ``OnlineLearning``.
+        explanation: Of the steps before.
     """
+    model = explanation.model
+    surprise = model.learning.surprise
+    measurements = _FEWEST_MEASUREMENTS + model.time * len(error)
+    share = explanation.wrong_measurements / measurements
+    more_probable = np.log1p(share / _WRONG_SENSOR)
     variance = np.diagonal(noise)
     squares = error**2 / (surprise * variance)
-    return _ANOTHER_SENSOR - 0.5 * (
-        surprise + np.log(2.0 * np.pi * variance) + np.log(squares.clip(1.0))
+    return (
+        _ANOTHER_SENSOR
+        + more_probable
+        - 0.5 * (surprise + np.log(2.0 * np.pi * variance) + np.log(squares.clip(1.0)))
     )
 
 

@@ -131,8 +131,6 @@ class LearningController:
         learned = None if previous is None else previous.learned
         if previous is None or learned is None:
             return LearningState.begin(self._model, measured)
-        if not is_measured(measured).all():
-            return learned.later()
         input = learned.input_of_policy
         was_decided_at_last_measurement = np.array_equal(
             previous.means[0], learned.planned_state
@@ -142,6 +140,8 @@ class LearningController:
         if input is None:
             return learned.after_gap(measured)
         try:
+            if not is_measured(measured).all():
+                return learned.later(input)
             return learn_from_step(learned, input, measured)
         except LINEAR_ALGEBRA_FAILURES:  # where the model has a mean and no slope
             return learned.after_gap(measured)

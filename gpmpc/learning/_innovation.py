@@ -39,10 +39,18 @@ class LearningStep(NamedTuple):
     point: Array  #: (phi, u, t), where d is seen
     #: what d was there: the error of the model alone, as far as d can explain it (k,)
     observed_change: Array
+    unexplained: Array  #: what d cannot explain of that error (n,)
     latent_variance: Array  #: variance of the model alone (k,)
     noise_variance: Array  #: variance of the noise of this flight (k,)
+    further_noise: Array  #: variances of what scatters sensors besides (n,)
+    follows_gap: bool  #: whether nothing was measured before it
 
     @property
     def repeats(self) -> NDArray[np.bool_]:
         """Which sensors show the same as before, to the last digit (n,)."""
         return self.state == self.next_state
+
+    @property
+    def teaches(self) -> bool:
+        """Whether what was measured before and after it says anything of the change."""
+        return not (self.follows_gap or self.repeats.all())

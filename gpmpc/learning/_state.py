@@ -1,13 +1,14 @@
 """What a flight has taught: the explanations of what was measured."""
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gpmpc._dynamics import Array
+from gpmpc._dynamics import Array, linearize, to_array
 from gpmpc.learning._changed_model import ChangedModel
+from gpmpc.mpc._sqp import LINEAR_ALGEBRA_FAILURES
 
 
 class Expectation(NamedTuple):
@@ -61,6 +62,9 @@ class Explanation:
     log_weight: float = 0.0  #: over that of the heaviest explanation
     #: time at which the plant became the one that it is [steps]; None if it always was
     began: float | None = None
+    #: time at which the plant was last moved by a push [steps]; None if it never was
+    pushed: float | None = None
+    wrong_measurements: int = 0  #: of single sensors, by this explanation
     #: steps for which it has agreed with a heavier one that all sensors are right
     agreed_steps: int = 0
 
@@ -73,6 +77,22 @@ class Explanation:
     def planning(self) -> ChangedModel | None:
         """The model that plans by this explanation; None for the one as learned."""
         return self.model if self.active else None
+
+    def later(self, input: Array) -> "Explanation":
+        """Returns the same a step later, where nothing was measured.
+
+        Args:
+            input: Applied in the step (m,).
+        """
+        model = self.model
+        planning = model if self.active else model.model
+        local = linearize(planning, self.expected.mean[None], input[None])
+        A = local.A[0]
+        moved = A @ self.expected.covariance @ A.T
+        noise = to_array(model.noise_covariance)
+        covariance = moved + cast(Array, local.covariance)[0] + noise
+        expected = Expectation(local.mean[0], covariance)
+        return replace(self, model=model.later(1.0), expected=expected)
 
     def believing(self, state: Array) -> "Explanation":
         """Returns the same where the plant is known to be at a state (n,)."""
@@ -96,17 +116,23 @@ class LearningState:
     """
 
     explanations: tuple[Explanation, ...]  #: heaviest first; one where nothing is odd
-    state: Array  #: the last one that was measured (n,)
-    #: what d was in the last step, by the heaviest explanation of its start (k,); NaN
-    #: where it is unknown
+    state: Array  #: measured (n,); where nothing was, what is expected
+    #: what d was in the last step whose start is known, by the heaviest explanation of
+    #: that (k,); NaN before the first
     observed_change: Array
+    #: likewise in the last step of which all sensors were believed (k,)
+    believed_change: Array
     #: squared differences of successive errors over those expected of the model's
     #: noise, of the last steps (w, k)
     noise_ratios: Array
+    #: squared errors that d cannot explain over those expected of the model's noise, of
+    #: the last steps (w, n); none where d explains all
+    further_ratios: Array
     version: int = 0  #: how often the model that plans has changed
-    #: what a loop applied at ``state`` in the place of a decision that failed there
-    #: (m,); None where no decision failed, or ``state`` is older than a step
+    #: what a loop applied at ``state`` in the place of a decision (m,); None where it
+    #: was decided, or nobody knows
     input_of_policy: Array | None = None
+    is_gap: bool = False  #: whether nothing was measured at ``state``
     #: whether the decision by the heaviest explanation has failed: what is measured is
     #: acted on, with the model as it was learned
     has_failed: bool = False
@@ -122,7 +148,9 @@ class LearningState:
             explanations=(Explanation.begin(model, state),),
             state=state,
             observed_change=np.full(outputs, np.nan),
+            believed_change=np.full(outputs, np.nan),
             noise_ratios=np.empty((0, outputs)),
+            further_ratios=np.empty((0, len(state))),
             version=version,
         )
 
@@ -173,12 +201,24 @@ class LearningState:
         change = self.planning
         return len(self.model.gp) + (0 if change is None else len(change))
 
-    def later(self) -> "LearningState":
-        """Returns the same a step later."""
-        explanations = tuple(
-            replace(one, model=one.model.later(1.0)) for one in self.explanations
+    def later(self, input: Array) -> "LearningState":
+        """Returns the state a step later, where nothing was measured.
+
+        Args:
+            input: Applied in the step (m,).
+        """
+        try:
+            explanations = tuple(one.later(input) for one in self.explanations)
+        except LINEAR_ALGEBRA_FAILURES:  # where the model has a mean and no slope
+            return self.after_gap(np.full_like(self.state, np.nan))
+        return replace(
+            self,
+            explanations=explanations,
+            state=explanations[0].expected.mean,
+            is_gap=True,
+            version=self.version + self.active,
+            input_of_policy=None,
         )
-        return replace(self, explanations=explanations, input_of_policy=None)
 
     def with_input_of_policy(self, input: Array) -> "LearningState":
         """Returns the same where a loop applies another input than was decided."""
@@ -188,8 +228,14 @@ class LearningState:
         self, explanations: tuple[Explanation, ...]
     ) -> "LearningState":
         """Returns the state with the explanations of one more step, and after it."""
-        version = self.version + (self.active or explanations[0].active)
-        return replace(self, explanations=explanations, version=version).later()
+        return replace(
+            self,
+            explanations=tuple(
+                replace(one, model=one.model.later(1.0)) for one in explanations
+            ),
+            version=self.version + (self.active or explanations[0].active),
+            input_of_policy=None,
+        )
 
     def without_change(self) -> "LearningState":
         """Returns the state after a decision has failed.
@@ -201,15 +247,11 @@ class LearningState:
         return replace(self, version=self.version + 1, has_failed=True)
 
     def after_gap(self, state: Array) -> "LearningState":
-        """Returns the state after steps without a measurement, at the next one (n,).
+        """Returns the state after a step of which nobody knows what led to its end.
 
-        Nothing is known of the step that led to it.
+        Args:
+            state: Measured there (n,); NaN where nothing was.
         """
         state = np.array(state, dtype=float)
-        at_measurement = replace(
-            self,
-            state=state,
-            observed_change=np.full_like(self.observed_change, np.nan),
-            has_failed=False,
-        )
+        at_measurement = replace(self, state=state, is_gap=False, has_failed=False)
         return at_measurement.with_explanations((self.heaviest.believing(state),))

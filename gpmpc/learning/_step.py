@@ -35,8 +35,8 @@ _MOST_RATIOS = 100
 _LATEST_RATIOS = 9
 _NOTABLE_RATIO = 2.0
 _LARGEST_RATIO = 1e4
-# Differences of which the median is taken, at least: those that are not known yet count
-# as of the model's own noise, since one sensor may be wrong from the beginning.
+# Ratios of which the median is taken, at least: those that are not known yet count as
+# of the model's own noise, since one sensor may be wrong from the beginning.
 _FEWEST_OF_MEDIAN = 16
 _MOST_EXPLANATIONS = 8
 _LARGEST_LEAD = 20.0  # of the heaviest explanation's log weight, over those kept
@@ -68,13 +68,8 @@ def learn_from_step(
     model = before.model
     error = state_difference(measured, predicted.mean, model.angles)
     observed_change = model.B_inverse @ error
-    after = replace(
-        before,
-        state=measured,
-        observed_change=observed_change,
-        noise_ratios=_with_noise_ratio(before, observed_change),
-        has_failed=False,
-    )
+    unexplained = error - model.B_array @ observed_change
+    after = _at_measurement(before, measured, observed_change, unexplained)
     if len(after.noise_ratios) < _FEWEST_RATIOS:
         return after.with_explanations((before.heaviest.believing(measured),))
     step = LearningStep(
@@ -83,8 +78,11 @@ def learn_from_step(
         next_state=measured,
         point=predicted.point,
         observed_change=observed_change,
+        unexplained=unexplained,
         latent_variance=model.explainable_variance(predicted.latent),
         noise_variance=_noise_variance(after.noise_ratios, before.heaviest),
+        further_noise=_further_noise(after.further_ratios, model),
+        follows_gap=before.is_gap,
     )
     if len(before.explanations) == 1:
         ordinary = _ordinary_step(before.heaviest, step)
@@ -104,13 +102,45 @@ def learn_from_step(
     return after.with_explanations(tuple(explanations))
 
 
-def _with_noise_ratio(before: LearningState, observed_change: Array) -> Array:
-    """Returns the noise ratios (w, k) with those of a further observed change (k,)."""
-    difference = observed_change - before.observed_change
-    ratio = difference**2 / (2.0 * before.model.gp_noise)
-    if not np.isfinite(ratio).all():
-        return before.noise_ratios
-    return np.vstack([before.noise_ratios, ratio])[-_MOST_RATIOS:]
+def _at_measurement(
+    before: LearningState, measured: Array, observed_change: Array, unexplained: Array
+) -> LearningState:
+    """Returns the state at a measurement, with what the step says of the noise.
+
+    Args:
+        before: With the changes that were observed before.
+        measured: State after the step (n,).
+        observed_change: In the step (k,).
+        unexplained: What d cannot explain of the error (n,).
+    """
+    if before.is_gap:
+        return replace(before, state=measured, is_gap=False, has_failed=False)
+    model = before.model
+    believed_change = before.observed_change
+    difference = np.abs(observed_change - before.observed_change)
+    if not before.heaviest.expected.is_certain:
+        # A sensor that is wrong once has a part in one difference, and no offset has.
+        believed_change = before.believed_change
+        difference = np.minimum(difference, np.abs(observed_change - believed_change))
+    noise_ratios = before.noise_ratios
+    further_ratios = before.further_ratios
+    ratio = difference**2 / (2.0 * model.gp_noise)
+    if np.isfinite(ratio).all():
+        noise_ratios = np.vstack([noise_ratios, ratio])[-_MOST_RATIOS:]
+    if model.has_unreached_states:
+        # A sensor that repeats itself says nothing of noise.
+        scattered = np.where(before.state == measured, 0.0, unexplained)
+        ratio = scattered**2 / model.sensor_noise
+        further_ratios = np.vstack([further_ratios, ratio])[-_MOST_RATIOS:]
+    return replace(
+        before,
+        state=measured,
+        observed_change=observed_change,
+        believed_change=believed_change,
+        noise_ratios=noise_ratios,
+        further_ratios=further_ratios,
+        has_failed=False,
+    )
 
 
 def _noise_variance(noise_ratios: Array, heaviest: Explanation) -> Array:
@@ -127,16 +157,34 @@ def _noise_variance(noise_ratios: Array, heaviest: Explanation) -> Array:
     """
     gp_noise = heaviest.model.gp_noise
     outputs = len(gp_noise)
-    median = _median_with_unknown(noise_ratios) / _chi2_median(1)
+    median = _median(noise_ratios, _FEWEST_OF_MEDIAN) / _chi2_median(1)
     if heaviest.active:
         mean_ratios = noise_ratios.mean(axis=1)
-        together = _median_with_unknown(mean_ratios) * outputs / _chi2_median(outputs)
-        median = np.minimum(median, together)
+        together = _median(mean_ratios, _FEWEST_OF_MEDIAN)
+        median = np.minimum(median, together * outputs / _chi2_median(outputs))
     latest = _median(noise_ratios[-_LATEST_RATIOS:].ravel())
     if not _NOTABLE_RATIO < latest < _LARGEST_RATIO:
         latest = 0.0  # by chance, or no noise
-    ratio = np.maximum(median, latest / _chi2_median(1))
-    return gp_noise * ratio.clip(1.0)
+    return gp_noise * np.maximum(median, latest / _chi2_median(1)).clip(1.0)
+
+
+def _further_noise(further_ratios: Array, model: ChangedModel) -> Array:
+    """Returns the noise (n,) besides that of the GP, or that of the last steps.
+
+    What no change can explain is noise, however slowly it changes.
+
+    Args:
+        further_ratios: Of the last steps (w, n).
+        model: Whose noise it is.
+    """
+    if not len(further_ratios):
+        return model.further_noise
+    median = _median(further_ratios, _FEWEST_OF_MEDIAN) / _chi2_median(1)
+    latest = _median(further_ratios[-_LATEST_RATIOS:])
+    is_notable = (latest > _NOTABLE_RATIO) & (latest < _LARGEST_RATIO)
+    grown = np.where(is_notable, latest, 0.0) / _chi2_median(1)
+    variance = model.sensor_noise * np.maximum(median, grown)
+    return np.maximum(model.further_noise, variance)
 
 
 @cache
@@ -144,33 +192,34 @@ def _chi2_median(degrees: int) -> float:
     return float(chi2.median(degrees))
 
 
-def _median_with_unknown(ratios: Array) -> Any:
-    """Returns the median over the first axis, where unknown ones count as zero."""
-    count = len(ratios)
-    unknown = max(0, _FEWEST_OF_MEDIAN - count)
-    if unknown > count:
-        return 0.0 * ratios[0]
-    rank = (count - unknown) // 2
-    return np.partition(ratios, rank, axis=0)[rank]
-
-
-def _median(values: Array) -> Any:
+def _median(values: Array, fewest: int = 0) -> Any:
     """Returns the median over the first axis, the upper one of an even number.
 
     NumPy takes several times as long, which every step would pay.
+
+    Args:
+        values: Those that are known (w, ...); at least one.
+        fewest: Of which it is taken. As many as are missing count as zero.
     """
-    middle = len(values) // 2
-    return np.partition(values, middle, axis=0)[middle]
+    count = len(values)
+    unknown = max(0, fewest - count)
+    rank = (count + unknown) // 2 - unknown
+    if rank < 0:
+        return 0.0 * values[0]
+    return np.partition(values, rank, axis=0)[rank]
 
 
 def _ordinary_step(before: Explanation, step: LearningStep) -> Explanation | None:
     """Goes on where all sensors are right; None where anything asks for another way."""
     if not before.expected.is_certain or step.repeats.any() or is_settling(before):
         return None
-    comparison = before.model.predict_then_learn(step)
+    model = before.model
+    comparison = model.predict_then_learn(step)
     innovation = comparison.planned(before.active)
+    error = step.unexplained + model.B_array @ innovation.error
+    variance = model.B_squared @ innovation.variance + step.further_noise
     # What is no number is not quiet, too.
-    if not innovation.largest_square <= QUIET:
+    if not (error**2 <= QUIET * variance).all():
         return None
     learned = replace(before, model=comparison.model_with_step)
     return learned.believing(step.next_state).with_lead(comparison.lead)
@@ -217,18 +266,26 @@ def _continued(
         agreed_steps=agreed_steps,
     )
     expected = _expected_state(continuation, step)
-    after = replace(before, expected=expected, began=continuation.began)
-    if continuation.is_pushed or step.repeats.all():
-        return after  # that teaches nothing
+    after = replace(
+        before,
+        expected=expected,
+        began=continuation.began,
+        pushed=continuation.pushed,
+        wrong_measurements=before.wrong_measurements
+        + np.count_nonzero(continuation.wrong & ~step.repeats),
+    )
     model = before.model
     if continuation.is_new_plant:
         model = model.without_points()
+        after = replace(after, model=model, active=True, leads=np.empty(0))
+    if continuation.is_pushed or not step.teaches:
+        return after
     comparison = model.predict_then_learn(
         _observed_step(continuation, expected, step, model)
     )
     learned = replace(after, model=comparison.model_with_step)
     if continuation.is_new_plant:
-        return replace(learned, active=True, leads=np.empty(0))
+        return learned
     return learned.with_lead(comparison.lead)
 
 
@@ -274,10 +331,13 @@ def _observed_step(
         next_state=expected.mean,
         point=predicted.point,
         observed_change=model.B_inverse @ change,
+        unexplained=step.unexplained,
         latent_variance=model.explainable_variance(predicted.latent),
         noise_variance=(
             step.noise_variance
             + model.explainable_variance(predicted.from_start)
             + variance
         ),
+        further_noise=step.further_noise,
+        follows_gap=step.follows_gap,
     )

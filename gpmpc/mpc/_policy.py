@@ -513,26 +513,25 @@ def _learned_so_far(
 ) -> Any:
     """Returns what a flight has taught when a decision is not applied.
 
-    A controller that was called has learned up to this step's measurement; it learns
-    the step that begins here by the input that is applied. For one that was not called
-    the step counts as time, and ends in a gap.
+    A controller that was called has learned up to this step's measurement. One that was
+    not called knows the step that ends here by its input alone. Either learns the step
+    that begins here by the input that is applied.
 
     Args:
         decision: That failed; None where the controller was not called.
         last: Command of the step before.
         input: Of the policy (m,).
     """
+    learned: Any = None
     if decision is not None and decision.learned is not None:
         learned = decision.learned
-        if hasattr(learned, "with_input_of_policy"):
-            return learned.with_input_of_policy(input)
-        return learned
-    if last is None or last.plan is None:
-        return None
-    last_learned = last.plan.learned
-    if hasattr(last_learned, "later"):
-        return last_learned.later()
-    return last_learned
+    elif last is not None and last.plan is not None:
+        learned = last.plan.learned
+        if hasattr(learned, "later"):
+            learned = learned.later(last.input)
+    if hasattr(learned, "with_input_of_policy"):
+        learned = learned.with_input_of_policy(input)
+    return learned
 
 
 def _plan_of_policy(

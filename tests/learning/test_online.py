@@ -313,13 +313,66 @@ def test_a_step_is_expected_with_noise_of_states_without_gps():
         next_state=np.zeros(2),
         point=np.zeros(4),
         observed_change=np.zeros(1),
+        unexplained=np.zeros(2),
         latent_variance=np.zeros(1),
         noise_variance=changed.gp_noise,
+        further_noise=changed.further_noise,
+        follows_gap=False,
     )
     predicted = forecast(explanation, step.input)
     expected = continuations(explanation, predicted, step)[0].expected
     latent = gp.predict(torch.zeros(2), torch.zeros(1)).covariance
     assert np.allclose(expected.covariance, (latent + noise).numpy())
+
+
+def kinematic_model():
+    """The position follows from its rate, and has noise of its own but no GP."""
+
+    def moved(x, u):
+        return torch.stack([x[..., 0] + STEP * x[..., 1], x[..., 1]], dim=-1)
+
+    effect = torch.tensor([[STEP], [1.0]], dtype=torch.float64)
+    model = ResidualModel.train(moved, DATA, effect, trainer=Trainer(restarts=0))
+    further = torch.diag(torch.tensor([NOISE[0] ** 2, 0.0]))
+    return replace(model, noise=model.noise_covariance + further)
+
+
+def doubts(offsets, noise=NOISE[0], steps=100):
+    """Sensors in doubt (steps, 2) where what follows from a rate is measured.
+
+    Args:
+        offsets: Of the sensors (2,), by their steps.
+        noise: Standard deviation of the position's sensor.
+        steps: Of the flight.
+    """
+    random = np.random.default_rng(0)
+    state = np.zeros(2)
+    learned = LearningState.begin(ChangedModel(kinematic_model()), state)
+    in_doubt = []
+    for k in range(steps):
+        input = random.uniform(-1, 1, 1)
+        state = cart(state, input) + random.normal(0, [0.0, NOISE[1]])
+        sensor = random.normal(0, [noise, 0.0]) + offsets.get(k, np.zeros(2))
+        learned = learn_from_step(learned, input, state + sensor)
+        in_doubt.append(learned.sensors_in_doubt)
+    return np.array(in_doubt)
+
+
+@pytest.mark.parametrize("entry", [0, 1])
+def test_a_glitch_is_doubted_whether_its_sensor_has_a_gp_or_not(entry):
+    glitches = (1, 12, 20, 22, 26, 30, 32)  # the first before anything is doubted
+    glitch = np.zeros(2)
+    glitch[entry] = [0.1, 0.5][entry]
+    offsets = dict.fromkeys(glitches, glitch)
+    in_doubt = doubts(offsets, steps=40)
+    expected = np.zeros((40, 2), dtype=bool)
+    expected[glitches[1:], entry] = True
+    assert np.array_equal(in_doubt, expected)
+
+
+def test_a_sensor_without_a_gp_may_be_noisier_than_in_the_data():
+    in_doubt = doubts({}, noise=10.0 * NOISE[0])
+    assert np.count_nonzero(in_doubt[20:]) <= 1
 
 
 def test_a_sensor_of_unknown_noise_is_never_in_doubt():
