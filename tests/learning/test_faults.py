@@ -191,7 +191,7 @@ def test_a_measurement_in_doubt_is_not_acted_on():
     assert decisions[61].learned.assumed is None
 
 
-def test_a_sensor_is_doubted_beyond_a_measurement_that_is_missing():
+def test_a_doubt_outlives_a_measurement_that_is_missing():
     sensor = Sensor()
     sensor.offset[60:63, 0] = [0.5, NAN, 0.5]
     errors, decisions = flown(OnlineLearning(), lambda random: sensor)
@@ -200,7 +200,7 @@ def test_a_sensor_is_doubted_beyond_a_measurement_that_is_missing():
         assert decisions[k].learned.sensors_in_doubt.tolist() == [True, False]
 
 
-def test_a_wind_is_learned_where_every_third_measurement_is_missing():
+def test_a_wind_is_learned_where_each_third_step_is_missing():
     sensor = Sensor()
     sensor.offset[2::3] = NAN
     errors, decisions = flown(OnlineLearning(), lambda random: sensor, WIND)
@@ -210,7 +210,7 @@ def test_a_wind_is_learned_where_every_third_measurement_is_missing():
 
 def test_a_push_is_told_from_a_change_by_what_follows():
     states, inputs = excited(40, wind_from=20)
-    learned = taught(states[:31], inputs[:30])[-1]
+    learned = taught_along(states[:31], inputs[:30])[-1]
     pushed = cart(states[30], inputs[30], wind=0.8) + np.array([0.0, 0.08])
     after = learn_from_step(learned, inputs[30], pushed)
     points = {len(one.model) for one in after.explanations if one.expected.is_certain}
