@@ -63,3 +63,4 @@ def page(tmp_path, monkeypatch):
     loaded = set(sys.modules)
     yield partial(follow, folder=tmp_path)
     forget_modules_of(tmp_path, loaded)
+    torch.set_default_dtype(torch.float64)  # fixtures of the next file rely on it

@@ -4,6 +4,7 @@ import io
 import logging
 import multiprocessing
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -12,6 +13,8 @@ from contextlib import redirect_stderr, redirect_stdout
 from multiprocessing import forkserver
 from pathlib import Path
 from unittest import mock
+
+import torch
 
 ROOT = Path(__file__).resolve().parents[2]
 PATH = str(Path(sys.executable).with_name("gpmpc"))
@@ -63,9 +66,20 @@ def gpmpc(*arguments, cwd, **environment):
 
 
 def in_this_process(function, jobs, workers=None):
-    """Stands for ``in_processes``, each of which takes seconds to start."""
+    """Stands for ``in_processes``, each of which takes seconds to start.
+
+    What goes to a process and comes back is pickled, and torch is as it is there.
+    """
+    function = pickle.loads(pickle.dumps(function))
     for index, job in enumerate(jobs):
-        yield index, function(job)
+        sent = pickle.loads(pickle.dumps(job))
+        dtype = torch.get_default_dtype()
+        torch.set_default_dtype(torch.float32)
+        try:
+            answer = function(sent)
+        finally:
+            torch.set_default_dtype(dtype)
+        yield index, pickle.loads(pickle.dumps(answer))
 
 
 def forked(*arguments, cwd, trials_here=False, **environment):
@@ -156,7 +170,8 @@ def called(*arguments, cwd, **environment):
             code = end.code
         finally:
             os.chdir(here)
-            log.handlers, log.propagate, log.level = before
+            log.handlers, log.propagate, level = before
+            log.setLevel(level)  # which empties what children remember of it
             for number, handler in handlers.items():
                 signal.signal(number, handler)
     written = [stream.getvalue() for stream in streams]

@@ -466,9 +466,13 @@ def test_a_sweep_and_a_report_count_the_runs_of_other_code(sweep, tmp_path):
 
 def test_two_sweeps_share_a_tree(sweep, tmp_path):
     both = [begun(*SWEPT, "folder=tree", cwd=tmp_path) for _ in range(2)]
-    for process in both:
-        process.join(240)
-    assert [process.exitcode for process in both] == [0, 0]
+    try:
+        for process in both:
+            process.join(240)
+        assert [process.exitcode for process in both] == [0, 0]
+    finally:
+        for process in both:
+            process.kill()  # where they wait for each other
     assert results(tmp_path / "tree") == sweep[1]
 
 

@@ -581,7 +581,8 @@ def test_log_messages_show_once_and_a_searchs_steps_never(capsys):
             "training: output 1 of 6: evaluation 3"
         )
     finally:
-        log.handlers, log.propagate, log.level = before
+        log.handlers, log.propagate, level = before
+        log.setLevel(level)  # which empties what children remember of it
     shown = capsys.readouterr().out
     assert shown.count("constant columns are centred") == 1
     assert "evaluation" not in shown

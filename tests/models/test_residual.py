@@ -136,6 +136,25 @@ def test_the_jacobian_is_that_of_finite_differences(nominal):
         assert torch.allclose(by_input[..., d], slope, atol=1e-8)
 
 
+@pytest.mark.parametrize("nominal", [AFFINE, nonlinear])
+def test_a_batch_moves_alike_where_torch_follows_it(nominal):
+    residual_model = model(nominal)
+    means = torch.rand(2, 4, 3)
+    covariance = 0.01 * torch.eye(3) + 0.005
+    inputs = torch.rand(2, 4, 2)
+    batch = Gaussian(means, covariance.expand(2, 4, 3, 3))
+    followed = Gaussian(means.clone().requires_grad_(), batch.covariance)
+    moved = Linearization()(residual_model, batch, inputs)
+    by_autograd = Linearization()(residual_model, followed, inputs)
+    assert by_autograd.mean.requires_grad
+    assert torch.allclose(moved.mean, by_autograd.mean, atol=1e-12)
+    assert torch.allclose(moved.covariance, by_autograd.covariance, atol=1e-12)
+    one = Linearization()(
+        residual_model, Gaussian(means[1, 2], covariance), inputs[1, 2]
+    )
+    assert torch.allclose(moved.covariance[1, 2], one.covariance, atol=1e-12)
+
+
 def test_moment_matching_with_an_affine_nominal_model():
     residual_model = model()
     prior = belief()
