@@ -47,11 +47,12 @@ odd, and there is one explanation.
 
 What is assumed of sensors: their noise is white; what is wrong of them is wrong by more
 than some four deviations, and in fewer than half of the last nine steps. More often it
-counts as noise, and less is believed, as is an error that grows slowly. One that stays
-the same for some steps is taken for a plant that was moved: the loop then follows what
-is shown. The first five measurements are believed, and always those of a sensor of
-which the model says no noise. Nothing is learned where no two measurements follow each
-other, nor of a measurement that is late what delayed it.
+counts as noise. An error that grows slowly is believed. One that stays the same for
+some steps is taken for a plant that was moved: the loop then follows what is shown. The
+first five measurements are believed, and always those of a sensor of which the model
+says no noise. Where these are wrong, or a sensor drifts, a flight may be worse than
+without learning. Nothing is learned where no two measurements follow each other, and a
+late one counts as if it were not.
 
 ``_continuations`` weighs the ways to go on, ``_step`` keeps the heaviest and learns,
 ``_changed_model`` is the model f + B d, ``_state`` what one step hands to the next.
