@@ -39,7 +39,7 @@ each measurement it may go on in these ways:
 
 Each way multiplies the weight by its likelihood: the density of what the trusted
 sensors show, a broad density for each wrong one (``surprise``), and the prior
-probability of what happened. Sensors that were wrong before are so more probably. The
+probability of what happened. The
 heaviest few go on; without a measurement, as they predict. The controller plans by the
 heaviest one: with its model, from where it says that the plant is. A choice that was
 wrong is corrected by the next measurements, with what it has taught. Mostly nothing is

@@ -21,10 +21,6 @@ _PUSH = -18.0
 _OUTPUTS_APART = -3.0
 # Log prior of each sensor that is wrong, but for the first: they fail one by one.
 _ANOTHER_SENSOR = -5.0
-# Prior probability that a sensor is wrong, to which the share of those adds that were:
-# of so many measurements at least.
-_WRONG_SENSOR = 3e-4
-_FEWEST_MEASUREMENTS = 300
 # Steps for which a new plant does not change again: its first points are still to say
 # how the change depends on state and input.
 _SETTLING_STEPS = 5
@@ -192,8 +188,7 @@ def _log_outlier(error: Array, noise: Array, explanation: Explanation) -> Array:
     """Returns the log density of what a wrong sensor shows (n,).
 
     It may be wrong by any order of magnitude. At a squared error of ``surprise`` noise
-    variances it is as probable as a right one; at a smaller one where sensors have been
-    wrong before.
+    variances it is as probable as a right one.
 
     Args:
         error: Measured less expected (n,).
@@ -202,15 +197,10 @@ def _log_outlier(error: Array, noise: Array, explanation: Explanation) -> Array:
     """
     model = explanation.model
     surprise = model.learning.surprise
-    measurements = _FEWEST_MEASUREMENTS + model.time * len(error)
-    share = explanation.wrong_measurements / measurements
-    more_probable = np.log1p(share / _WRONG_SENSOR)
     variance = np.diagonal(noise)
     squares = error**2 / (surprise * variance)
-    return (
-        _ANOTHER_SENSOR
-        + more_probable
-        - 0.5 * (surprise + np.log(2.0 * np.pi * variance) + np.log(squares.clip(1.0)))
+    return _ANOTHER_SENSOR - 0.5 * (
+        surprise + np.log(2.0 * np.pi * variance) + np.log(squares.clip(1.0))
     )
 
 

@@ -64,7 +64,6 @@ class Explanation:
     began: float | None = None
     #: time at which the plant was last moved by a push [steps]; None if it never was
     pushed: float | None = None
-    wrong_measurements: int = 0  #: of single sensors, by this explanation
     #: steps for which it has agreed with a heavier one that all sensors are right
     agreed_steps: int = 0
 

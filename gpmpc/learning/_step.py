@@ -271,8 +271,6 @@ def _continued(
         expected=expected,
         began=continuation.began,
         pushed=continuation.pushed,
-        wrong_measurements=before.wrong_measurements
-        + np.count_nonzero(continuation.wrong & ~step.repeats),
     )
     model = before.model
     if continuation.is_new_plant:
