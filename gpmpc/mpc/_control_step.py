@@ -257,7 +257,10 @@ class ControlStep:
             if continuity.goes_on:
                 # The next decision compares the length of its step with this one.
                 self._squared_lengths.append(continuity.squared_length)
-                return Iterate(planned, solution.status)
+                # Rows are kept where the plan leads to, not where a line does.
+                has_rows = self._prediction.constraints.per_stage > 0
+                needs_roll_out = has_rows and not continuity.is_slight
+                return Iterate(planned, solution.status, needs_roll_out)
         if self._globalization is None:
             self._globalization = Globalization(
                 self._prediction,
