@@ -141,7 +141,7 @@ def test_a_project_takes_no_name_that_means_something_else(name, message, tmp_pa
             ["new", "2arms"],
             "NAME: must be letters, digits and _, a letter first; got '2arms'",
         ),
-        (["new", "class"], "NAME: must be letters"),
+        (["new", "class"], "NAME: class is the name of a keyword of Python; choose"),
         (
             ["new", "arm", "--to", "."],
             "to: . is not an empty folder; nothing was written",

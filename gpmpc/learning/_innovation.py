@@ -19,11 +19,6 @@ class Innovation(NamedTuple):
     variance: Array  #: expected of the error (k,)
 
     @property
-    def largest_square(self) -> float:
-        """The largest squared error over its variance."""
-        return float((self.error**2 / self.variance).max())
-
-    @property
     def log_density(self) -> float:
         """Log density of the error, as independent Gaussians, up to a constant."""
         squares = self.error**2 / self.variance

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gpmpc._dynamics import Array, linearize, to_array
 from gpmpc.learning._changed_model import ChangedModel
-from gpmpc.mpc._sqp import LINEAR_ALGEBRA_FAILURES
+from gpmpc.mpc._sqp import FAILURES
 
 
 class Expectation(NamedTuple):
@@ -115,7 +115,9 @@ class LearningState:
     """
 
     explanations: tuple[Explanation, ...]  #: heaviest first; one where nothing is odd
-    state: Array  #: measured (n,); where nothing was, what is expected
+    #: measured (n,); where nothing was, what is expected, and NaN of sensors that were
+    #: in doubt
+    state: Array
     #: what d was in the last step whose start is known, by the heaviest explanation of
     #: that (k,); NaN before the first
     observed_change: Array
@@ -208,12 +210,13 @@ class LearningState:
         """
         try:
             explanations = tuple(one.later(input) for one in self.explanations)
-        except LINEAR_ALGEBRA_FAILURES:  # where the model has a mean and no slope
+        except FAILURES:  # where the model has no number, or no slope
             return self.after_gap(np.full_like(self.state, np.nan))
+        expected_state = explanations[0].expected.mean
         return replace(
             self,
             explanations=explanations,
-            state=explanations[0].expected.mean,
+            state=np.where(self.sensors_in_doubt, np.nan, expected_state),
             is_gap=True,
             version=self.version + self.active,
             input_of_policy=None,

@@ -128,7 +128,7 @@ def _at_measurement(
     if np.isfinite(ratio).all():
         noise_ratios = np.vstack([noise_ratios, ratio])[-_MOST_RATIOS:]
     if model.has_unreached_states:
-        # A sensor that repeats itself says nothing of noise.
+        # A sensor that repeats itself counts as one that does not scatter.
         scattered = np.where(before.state == measured, 0.0, unexplained)
         ratio = scattered**2 / model.sensor_noise
         further_ratios = np.vstack([further_ratios, ratio])[-_MOST_RATIOS:]

@@ -82,9 +82,10 @@ def compare(
 
 
 def independent_predictions(windows: Windows, steps: Sequence[int]) -> Array:
-    """Counts the predictions (steps,) that do not overlap.
+    """Counts the predictions (steps,) that say something of their own.
 
-    Those of different pieces do not: each piece has one at least.
+    In each piece that is one, and as many more as fit into the rows of its starts; a
+    part of one counts as a part.
 
     Args:
         windows: From whose starts is predicted.
@@ -96,7 +97,7 @@ def independent_predictions(windows: Windows, steps: Sequence[int]) -> Array:
 
 
 def predictions_of_pieces(starts: Array, steps: Array) -> Array:
-    """Counts the predictions (steps,) of pieces that do not overlap.
+    """Counts the predictions (steps,) of pieces that say something of their own.
 
     Args:
         starts: Rows from the first to the last start of each piece (pieces,), one at

@@ -481,9 +481,12 @@ def _are_units(fields: Fields, names: Fields) -> bool:
 
     All are known, or one is a unit of times and stands below the name of a time: then
     others are units that are not known here. Fields that come twice below names that
-    do not are no names: RAD below THE and PHI.
+    do not are no names: RAD below THE and PHI. Below a title they may be, with a time.
     """
-    if len({*fields}) < len(fields) and len({*names}) == len(names):
+    filled = [field for field in fields if field]
+    has_repeats = len({*filled}) < len(filled)
+    has_time = any(is_name_of_time(field) for field in filled)
+    if has_repeats and not has_time and len({*names}) == len(names):
         return True
     units = [field.strip("[]() ") for field in fields]
     are_known = all(

@@ -39,7 +39,7 @@ _STRIDE_WITH_MEMORY = 8  # of the windows that are linearised of these
 _DIFFERENCE_OF_OUTPUTS = 1e-4  # of their ranges: in them a step is linear
 _LARGEST_CLAIM = 9.0  # of the mean squared error: the variance claimed at most
 _STRETCHES = 16  # of the held-out rows, one after the other,
-_RARE_STRETCHES = 2  # of which so many may err more than any other, and then count
+_USUAL_STRETCHES = 8  # to each of which one may err more than any other, and counts
 _RAREST_ERROR = 3.0  # times the mean squared error of the next one at most
 _WINDOWS_PER_STRETCH = 4  # at least
 _LEAST_FREEDOM = 4.0  # independent errors that a variance is supposed to be of
@@ -341,10 +341,11 @@ def _mean_of_finite(squared: Sequence[Array]) -> Array:
 
 
 def _usual_mean(squared: Array) -> Array:
-    """Averages squared errors (W, steps, e), whatever happened once or twice.
+    """Averages squared errors (W, steps, e) so that a rare wild stretch counts little.
 
     A vehicle whose heading comes from its movement has none before it starts. An
-    interval as wide as such an error would be too wide ever after.
+    interval as wide as such an error would be too wide ever after. Where there are
+    fewer than eight stretches, all count.
 
     Args:
         squared: Of windows, those of a run one after the other. NaN does not count;
@@ -355,10 +356,11 @@ def _usual_mean(squared: Array) -> Array:
     counts = np.array([np.sum(~np.isnan(part), axis=0) for part in parts])
     sums = np.array([np.nansum(part, axis=0) for part in parts])
     means = sums / np.maximum(counts, 1)
-    if stretches > 2 * _RARE_STRETCHES:
-        next_mean = np.sort(means, axis=0)[-1 - _RARE_STRETCHES]
-        capped = np.minimum(means, _RAREST_ERROR * next_mean)
-        means = np.where(next_mean > 0, capped, means)
+    rare_stretches = stretches // _USUAL_STRETCHES
+    if rare_stretches:
+        largest_usual = np.sort(means, axis=0)[-1 - rare_stretches]
+        capped = np.minimum(means, _RAREST_ERROR * largest_usual)
+        means = np.where(largest_usual > 0, capped, means)
     count = counts.sum(axis=0)
     total = (counts * means).sum(axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), np.inf)

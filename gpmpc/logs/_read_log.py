@@ -80,11 +80,11 @@ def read_log(
     rest_ranges = least_motion(
         [mapping.split(table.values).states for table in tables], step
     )
-    settles = is_settled_at_rest(tables, step, rest_ranges, mapping)
+    keep_rest = is_settled_at_rest(tables, step, rest_ranges, mapping)
     runs = []
     for table in tables:
         run_findings = RunFindings(table.name, findings)
-        run = select_rows(table, step, rest_ranges, settles, mapping, run_findings)
+        run = select_rows(table, step, rest_ranges, keep_rest, mapping, run_findings)
         if run is not None:
             runs.append(run)
     _check_unchanging(runs, findings)

@@ -37,6 +37,7 @@ _PARTS_OF_DATE = re.compile(
     r"^\s*(\d{4})[-_/.](\d\d?)[-_/.](\d\d?)[-_ T]+(\d\d?)[-_:.](\d\d?)"
     r"[-_:.](\d\d?)(?:[-_:.,](\d+))?\s*$"
 )
+_DECIMALS = re.compile(r"[.,]\d+\s*$")
 _WITH_UNIT = re.compile(r"^\s*(-?\d+(?:\.\d+)?)\s*([^\W\d_]+)\s*$")
 _SAMPLE = 50  # rows in which texts are looked at: are they dates?
 _SAME_SPAN = 0.02  # of the time that a log took: a clock in its messages goes as far
@@ -242,7 +243,13 @@ def _in_iso_format(texts: pd.Series) -> pd.Series:
     year, month, day, hour, minute, second = (
         parts[index].str.zfill(2) for index in range(6)
     )
+    # Behind another mark than a point these are whole ms, or us.
     fraction = parts[6].fillna("0")
+    are_counts = ~texts.astype("string").str.contains(_DECIMALS, na=False)
+    as_milliseconds = fraction.str.zfill(3)
+    as_microseconds = fraction.str.zfill(6)
+    counts = as_milliseconds.where(fraction.str.len() <= 3, as_microseconds)
+    fraction = fraction.where(~are_counts, counts)
     date = year + "-" + month + "-" + day
     return date + "T" + hour + ":" + minute + ":" + second + "." + fraction
 

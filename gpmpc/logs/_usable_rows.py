@@ -56,11 +56,11 @@ def least_motion(states: Sequence[Array], step: float) -> Array:
 def is_settled_at_rest(
     tables: Sequence[RunTable], step: float, rest_ranges: Array, mapping: LogMapping
 ) -> bool:
-    """Returns whether states rest at other values where inputs rest at other ones.
+    """Returns whether the values at which states rest depend on the inputs.
 
-    So does a process that settles after every step of an input: rows at rest tell its
-    gain. A vehicle that waits is at rest whatever its steering is. Systems whose
-    physics the mapping names have states that no input holds, such as a position.
+    They do for a process that settles after every step of an input: rows at rest tell
+    its gain. A vehicle that waits is at rest whatever its steering is. Vehicles that
+    the mapping names (``model``) have states that no input holds, such as a position.
 
     Args:
         tables: Of all runs.
@@ -68,14 +68,14 @@ def is_settled_at_rest(
         rest_ranges: Up to which states do not move (n,); see ``least_motion``.
         mapping: Of the log.
     """
-    if mapping.model != "none":
+    if mapping.model != "none" or mapping.rest == "use":
         return False
     states_at_rest = []
     inputs_at_rest = []
     for table in tables:
         values = mapping.split(table.values)
         at_rest = _at_rest(values.states, values.inputs, rest_ranges, step)
-        at_rest &= ~np.isnan(table.values).any(axis=1)
+        at_rest &= ~np.isnan(table.values).any(axis=1) & ~table.outside_keep
         states_at_rest.append(values.states[at_rest])
         inputs_at_rest.append(values.inputs[at_rest])
     states = np.concatenate(states_at_rest)
@@ -87,15 +87,17 @@ def is_settled_at_rest(
     means = np.stack(
         [np.bincount(groups, column) / counts for column in states.T], axis=-1
     )
-    within = np.sqrt(np.square(states - means[groups]).mean(axis=0))
-    return bool((np.ptp(means, axis=0) > np.maximum(rest_ranges, within)).any())
+    scatter = np.sqrt(np.square(states - means[groups]).mean(axis=0))
+    differ_by = np.ptp(means, axis=0)
+    # By more than they scatter where inputs are the same.
+    return bool((differ_by > np.maximum(rest_ranges, scatter)).any())
 
 
 def select_rows(
     table: RunTable,
     step: float,
     rest_ranges: Array,
-    settles: bool,
+    keep_rest: bool,
     mapping: LogMapping,
     findings: RunFindings,
 ) -> LogRun | None:
@@ -105,7 +107,7 @@ def select_rows(
         table: Of the run.
         step: Time step of the log [s].
         rest_ranges: Up to which states do not move (n,); see ``least_motion``.
-        settles: Whether rows at rest are kept; see ``is_settled_at_rest``.
+        keep_rest: Whether rows at rest stay in; see ``is_settled_at_rest``.
         mapping: Says what is left out.
         findings: Of the run, which takes what is left out.
 
@@ -116,20 +118,23 @@ def select_rows(
     values = mapping.split(table.values)
     rows = _RowSelection(len(table.time), findings)
     rows.leave_out(table.outside_keep, "outside of keep", "outside the ranges of keep")
+    is_settled = np.zeros(len(table.time), dtype=bool)
     if mapping.rest == "drop":
         at_rest = _at_rest(values.states, values.inputs, rest_ranges, step)
-        if settles:
+        if keep_rest:
+            is_settled = at_rest & rows.usable
             text = (
-                f"{at_rest.sum()} of {len(at_rest)} rows where nothing moves: states "
-                "rest at other values for other inputs, which tells the gain; left in"
+                f"{is_settled.sum()} of {len(at_rest)} rows where nothing moves: "
+                "states rest at other values for other inputs, which tells the gain; "
+                "left in"
             )
-            findings.add("settled", at_rest.sum(), text)
+            findings.add("settled", is_settled.sum(), text)
         else:
             text = "where nothing moves (rest: use keeps them)"
             rows.leave_out(at_rest, "at rest", text)
     is_missing = np.asarray(np.isnan(table.values).any(axis=1))
     rows.leave_out(is_missing, "missing value", "in a gap or without a value")
-    fault = _leave_out_held_values(rows, values.states, mapping)
+    fault = _leave_out_held_values(rows, is_settled, values.states, mapping)
     if fault:
         findings.add(UNCHANGING, len(table.time), f"is left out: {fault}")
         return None
@@ -168,20 +173,23 @@ class _RowSelection:
 
 
 def _leave_out_held_values(
-    rows: _RowSelection, states: Array, mapping: LogMapping
+    rows: _RowSelection, is_settled: np.ndarray, states: Array, mapping: LogMapping
 ) -> str:
     """Leaves out rows in which a whole signal of the states repeats the row before.
 
-    Returns what is wrong where these are too many; empty otherwise.
+    What has settled (K,) repeats by itself, and counts for nothing here. Returns what
+    is wrong where these are too many; empty otherwise.
     """
-    usable = rows.usable.copy()  # of all signals the same: they may repeat in turn
+    # of all signals the same: they may repeat in turn
+    usable = rows.usable & ~is_settled
     count = usable.sum()
     for signal, columns in zip(
         mapping.of("states"), mapping.space.columns, strict=True
     ):
         if (signal.held or mapping.held) == "use":
             continue
-        if len(signal.columns) < 2:  # a single one may repeat by its resolution
+        # A single entry may repeat by its resolution.
+        if columns.stop - columns.start < 2:
             continue
         repeats = (states[1:, columns] == states[:-1, columns]).all(axis=1)
         is_repeated = np.r_[False, repeats] & usable

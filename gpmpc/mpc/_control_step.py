@@ -257,8 +257,7 @@ class ControlStep:
             if continuity.goes_on:
                 # The next decision compares the length of its step with this one.
                 self._squared_lengths.append(continuity.squared_length)
-                needs_roll_out = self._may_miss_rows and not continuity.is_slight
-                return Iterate(planned, solution.status, needs_roll_out)
+                return Iterate(planned, solution.status)
         if self._globalization is None:
             self._globalization = Globalization(
                 self._prediction,
@@ -273,17 +272,6 @@ class ControlStep:
         # Where the number of programs is open, the tolerance is loose.
         needs_roll_out = not is_solved or self._settings.number_is_open
         return iterate._replace(needs_roll_out=needs_roll_out)
-
-    @property
-    def _may_miss_rows(self) -> bool:
-        """Whether a long step's plan may miss rows that its program keeps.
-
-        The states of the plan are those of the linearised model: where its inputs lead
-        to may be beside them. Where means depend on covariances that is left open: a
-        roll-out there takes as long as many programs.
-        """
-        has_rows = self._prediction.constraints.per_stage > 0
-        return has_rows and not self._prediction.linearizer.depends_on_covariance
 
     @property
     def _may_stop_after_one(self) -> bool:

@@ -243,8 +243,9 @@ class Decision:
     plan_novelty: float | Callable[[], float] = math.nan
     #: what the flight has taught a controller that learns (``gpmpc.learning``), for its
     #: next decision; with ``size``, the points of the model that decided, and
-    #: ``version``, how often it has changed; where it has ``later()``, that is what is
-    #: handed on after a step at which the controller was not called
+    #: ``version``, how often it has changed. Where it has ``later(input)``, that is
+    #: handed on after a step of this input (m,), at whose end the controller was not
+    #: called
     learned: Any = None
     #: steps by which a policy has moved the plan on since it was decided: its first
     #: mean is then predicted, and not measured

@@ -164,7 +164,6 @@ class Continuity(NamedTuple):
 
     goes_on: bool
     squared_length: float  # of the step, in the metric of the cost
-    is_slight: bool  # beside the cost
 
 
 def measure_continuity(
@@ -181,15 +180,12 @@ def measure_continuity(
     iterating each of them is slower and, on swing-ups, no better.
     """
     cost, squared_length = _measure_step.unchecked(local, request.references, proposed)
-    slight = _SLIGHT_STEP * (max(cost, 0.0) + smallest_cost(prediction, request))
-    is_slight = squared_length <= slight
     last_lengths = () if request.last_plan is None else request.last_plan.steps
-    goes_on = is_slight
     if len(last_lengths) == 0:
-        goes_on = True
-    elif not is_slight:
-        goes_on = squared_length <= _FURTHER * last_lengths[0]
-    return Continuity(goes_on, squared_length, is_slight)
+        return Continuity(True, squared_length)
+    slight = _SLIGHT_STEP * (max(cost, 0.0) + smallest_cost(prediction, request))
+    longest = max(slight, _FURTHER * last_lengths[0])
+    return Continuity(squared_length <= longest, squared_length)
 
 
 def smallest_cost(prediction: PredictionModel, request: Request) -> float:

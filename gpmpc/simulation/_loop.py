@@ -222,10 +222,12 @@ def rehearse(
 ) -> None:
     """Flies the first two steps, without noise, and forgets them.
 
-    A flight's times then hold no compiling and loading. There are two, since the second
-    one starts from a plan, or one where the references are of no more. What fails here
-    is left to the flight to raise. What a controller of one's own remembers of them,
-    such as a filter's belief, it has to forget by itself.
+    A flight's times then hold no compiling and loading, but of kernels that few
+    programs need, such as those of unstable plans: ``warm_up`` loads these, too. There
+    are two steps, since the second one starts from a plan, or one where the references
+    are of no more. What fails here is left to the flight to raise. What a
+    controller of one's own remembers of them, such as a filter's belief, it has to
+    forget by itself.
 
     See Also:
         ``closed_loop``; ``gpmpc.mpc.ControlLoop.warm_up``, without a plant.

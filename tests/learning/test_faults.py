@@ -575,6 +575,9 @@ def test_feedback_between_plans_is_not_that_of_a_sensor_in_doubt():
     between = loop.input_between(doubted, 0.0)
     assert between == pytest.approx(loop.last.decision.input)
     assert between != loop.input_between(np.add(doubted, [0.0, 0.1]), 0.0)
+    loop.input(np.full(2, np.nan), np.zeros(2))
+    between = loop.input_between(doubted, 0.0)
+    assert between == loop.input_between(np.add(doubted, [0.3, 0.0]), 0.0)
 
 
 def test_a_first_plan_is_handed_on():

@@ -271,6 +271,11 @@ def test_units_in_capitals_are_no_names(tmp_path):
     mapping = {"time": "T", "states": {"pitch": ["THE"]}, "inputs": {"roll": ["PHI"]}}
     log = read_log(tmp_path / "log.asc", mapping)
     np.testing.assert_array_equal(log.runs[0].states[:, 0], TABLE["x"])
+    titled = "Data of run\nt x u u\n"
+    (tmp_path / "titled.txt").write_text(titled + rows.replace("\n", " 0\n"))
+    mapping = {"time": "t", "states": {"x": ["x"]}, "inputs": {"u": [3]}}
+    log = read_log(tmp_path / "titled.txt", mapping)
+    np.testing.assert_array_equal(log.runs[0].states[:, 0], TABLE["x"])
 
 
 def test_a_run_that_comes_twice_is_found(tmp_path):

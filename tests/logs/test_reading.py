@@ -589,6 +589,12 @@ def test_what_settles_after_steps_of_an_input_is_no_rest(tmp_path):
         assert len(log) == len(drive)
         assert log.longest_piece == len(drive)
         assert kinds(log).get("settled", 0) == pytest.approx(rests, abs=100)
+    # A signal of several columns repeats itself when it has settled.
+    columns["y"] = -columns["x"]
+    columns |= {name: np.round(columns[name], 2) for name in ("x", "y")}
+    pair = {**mapping, "states": {"levels": ["x", "y"]}}
+    log = read_log(written(tmp_path, pandas.DataFrame(columns)), pair)
+    assert log.longest_piece == len(drive)
     # What waits is at rest for every input that moves nothing.
     waits = np.repeat([True, False, True, False, True], 300)
     steering = np.repeat([0.0, 0.2, 0.4, -0.1, -0.3], 300)

@@ -441,6 +441,15 @@ def test_times_in_texts_are_read(tmp_path, text):
     assert inspect_log(tmp_path / "a.csv").streams["rate [Hz]"][0] == 2
 
 
+def test_milliseconds_of_a_date_may_have_fewer_digits(tmp_path):
+    rows = [
+        f"2024_5_1_12_0_{k // 20}_{50 * (k % 20)},{k % 7},{k % 3}\n" for k in range(60)
+    ]
+    (tmp_path / "a.csv").write_text("t,x,u\n" + "".join(rows))
+    log = read_log(tmp_path / "a.csv", {"time": "t", **SIGNALS})
+    assert (log.time_step, kinds(log)) == (0.05, {})
+
+
 def test_a_unit_of_time_other_than_the_mappings_is_noted(tmp_path):
     rows = [f"{20 * k},{k % 7},{k % 3}\n" for k in range(60)]
     (tmp_path / "a.csv").write_text("t [ms],x,u\n" + "".join(rows))

@@ -138,34 +138,6 @@ def puck(x, u):
     return torch.stack(parts, -1)
 
 
-def _heated(x, u):
-    cooling = x[..., :1] * (1.0 + x[..., :1] ** 2)
-    temperature = x[..., :1] + 0.1 * (x[..., 1:] - cooling)
-    return torch.cat([temperature, x[..., 1:] + 0.1 * u], dim=-1)
-
-
-def test_a_long_step_beside_a_bound_ends_where_its_inputs_lead():
-    model = KnownModel(_heated, state_dim=2, input_dim=1)
-    problem = Problem(
-        Tracking([1.0, 0.01], [0.01]),
-        inputs=Box([-20.0], [20.0]),
-        constraints=[Box([-np.inf, -np.inf], [1.05, np.inf])],
-    )
-    controller = GPMPC(model, Linearization(), problem, 15, initial_input=[0.0])
-    reference = Reference(np.array([1.0, 2.0]))
-    first = controller.control(Gaussian.certain(torch.tensor([-1.0, 0.0])), reference)
-    decision = controller.control(
-        Gaussian.certain(torch.from_numpy(first.means[1])), reference, first
-    )
-    assert decision.iterations == 1
-    assert decision.status is Status.SOLVED
-    states = [decision.means[0]]
-    for input in decision.inputs:
-        after = _heated(torch.from_numpy(states[-1]), torch.from_numpy(input))
-        states.append(after.numpy())
-    np.testing.assert_allclose(decision.means, states, atol=1e-9)
-
-
 @pytest.mark.parametrize("h", [ellipsoid, distance, energy])
 @pytest.mark.parametrize("stages", [None, [8]], ids=["all stages", "the last"])
 @pytest.mark.parametrize("iterations", [None, 1, 30])
