@@ -177,8 +177,9 @@ def _leave_out_held_values(
 ) -> str:
     """Leaves out rows in which a whole signal of the states repeats the row before.
 
-    What has settled (K,) repeats by itself, and counts for nothing here. Returns what
-    is wrong where these are too many; empty otherwise.
+    What has settled (K,) repeats by itself, and goes on for a while after a step of an
+    input: that counts for nothing here. Returns what is wrong where these are too many;
+    empty otherwise.
     """
     # of all signals the same: they may repeat in turn
     usable = rows.usable & ~is_settled
@@ -192,7 +193,10 @@ def _leave_out_held_values(
         if columns.stop - columns.start < 2:
             continue
         repeats = (states[1:, columns] == states[:-1, columns]).all(axis=1)
-        is_repeated = np.r_[False, repeats] & usable
+        is_repeated = np.r_[False, repeats]
+        values = np.cumsum(~is_repeated)  # numbers of the values, one after the other
+        has_settled = np.isin(values, values[is_settled])
+        is_repeated &= usable & ~has_settled
         if is_repeated.sum() >= max(count - 1, 1):
             return (
                 f"{signal.name} never changes: its sensor was silent; leave it out, or "

@@ -591,7 +591,6 @@ def test_what_settles_after_steps_of_an_input_is_no_rest(tmp_path):
         assert kinds(log).get("settled", 0) == pytest.approx(rests, abs=100)
     # A signal of several columns repeats itself when it has settled.
     columns["y"] = -columns["x"]
-    columns |= {name: np.round(columns[name], 2) for name in ("x", "y")}
     pair = {**mapping, "states": {"levels": ["x", "y"]}}
     log = read_log(written(tmp_path, pandas.DataFrame(columns)), pair)
     assert log.longest_piece == len(drive)
