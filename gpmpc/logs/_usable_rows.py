@@ -318,7 +318,7 @@ def _at_rest(
         return np.zeros(len(states), dtype=bool)
     limit = np.concatenate([rest_ranges, np.zeros(inputs.shape[1])])
     values = np.concatenate([states, inputs], axis=1)
-    is_still = (_range_within(values, size) <= limit).all(axis=1)
+    is_still = np.asarray((_range_within(values, size) <= limit).all(axis=1))
     is_still[: size // 2] = False  # the window begins before the run
     is_still[len(is_still) - size // 2 :] = False
     # A maximum takes the same time for any size, a dilation by the rows of one second
