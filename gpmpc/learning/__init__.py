@@ -39,11 +39,10 @@ each measurement it may go on in these ways:
 
 Each way multiplies the weight by its likelihood: the density of what the trusted
 sensors show, a broad density for each wrong one (``surprise``), and the prior
-probability of what happened. The
-heaviest few go on; without a measurement, as they predict. The controller plans by the
-heaviest one: with its model, from where it says that the plant is. A choice that was
-wrong is corrected by the next measurements, with what it has taught. Mostly nothing is
-odd, and there is one explanation.
+probability of what happened. The heaviest few go on; without a measurement, as they
+predict. The controller plans by the heaviest one: with its model, from where it says
+that the plant is. A choice that was wrong is corrected by the next measurements, with
+what it has taught. Mostly nothing is odd, and there is one explanation.
 
 What is assumed of sensors: their noise is white; what is wrong of them is wrong by more
 than some four deviations, and in fewer than half of the last nine steps. More often it

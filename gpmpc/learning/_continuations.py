@@ -150,7 +150,7 @@ def continuations(
     if not frozen.any() and (error**2 <= QUIET * variance).all():
         # Nothing asks for another way.
         same_plant = same_plant[-1:]
-        log_outlier = _log_outlier(error, noise, explanation)
+        log_outlier = _log_outlier(error, noise, surprise)
         (_, log_likelihood), *_ = _sensor_sets(
             error, same_plant[0].expected, frozen, log_outlier
         )
@@ -161,7 +161,7 @@ def continuations(
     hypotheses = same_plant + _new_plants(explanation, predicted, noise)
     for expected, log_prior, is_new_plant in hypotheses:
         error = state_difference(step.next_state, expected.mean, model.angles)
-        log_outlier = _log_outlier(error, noise, explanation)
+        log_outlier = _log_outlier(error, noise, surprise)
         for wrong, log_likelihood in _sensor_sets(error, expected, frozen, log_outlier):
             if wrong.any():
                 log_likelihood -= _ANOTHER_SENSOR  # none for the first
@@ -184,7 +184,7 @@ def continuations(
     return found
 
 
-def _log_outlier(error: Array, noise: Array, explanation: Explanation) -> Array:
+def _log_outlier(error: Array, noise: Array, surprise: float) -> Array:
     """Returns the log density of what a wrong sensor shows (n,).
 
     It may be wrong by any order of magnitude. At a squared error of ``surprise`` noise
@@ -193,10 +193,8 @@ def _log_outlier(error: Array, noise: Array, explanation: Explanation) -> Array:
     Args:
         error: Measured less expected (n,).
         noise: Covariance of the noise (n, n).
-        explanation: Of the steps before.
+        surprise: Of ``OnlineLearning``.
     """
-    model = explanation.model
-    surprise = model.learning.surprise
     variance = np.diagonal(noise)
     squares = error**2 / (surprise * variance)
     return _ANOTHER_SENSOR - 0.5 * (

@@ -216,7 +216,7 @@ class ControlStep:
         bounds = self._prediction.program_bounds
         start = local.plan.states[0]
         references = self._request.references
-        if _loads_rare_kernels.get():
+        if _loads_rare_kernels.get():  # its result is not used
             condense_with_feedback.unchecked(
                 local.cost, bounds, local.stages, start, references, local.rows
             )

@@ -624,7 +624,7 @@ def test_a_goal_that_moves_without_notice_is_no_alarm():
         x = goal + 0.5 * (x - goal)
 
 
-def test_preparing_for_a_jump_whose_length_no_plan_knew_is_no_alarm():
+def test_preparing_for_a_jump_of_unknown_length_is_no_alarm():
     """A plan that sees one stage behind a jump does not move yet; later ones do."""
     steps = np.arange(120)
     goals = (steps >= 60).astype(float)
